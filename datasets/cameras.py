@@ -1,7 +1,7 @@
-"""Cameras, with a lens or without: from pixels to rays and back, and where to stand to see all of a shape.
+"""Cameras with lens distortion: pixels to rays and back, and orbits around a shape; in float64, for map coordinates.
 
-OpenCV's convention: x right, y down, z forward, and the centre of pixel (0, 0) at (0, 0), so that the image runs
-from −0.5 to width − 0.5. Everything is float64: at map coordinates (millions of metres) float32 has no centimetres.
+OpenCV's convention: x right, y down, z forward. The centre of pixel (0, 0) is at (0, 0): an image runs from −0.5 to
+width − 0.5.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ from torch import Tensor
 
 from ..neural_fields import Similarity
 
-__all__ = ["COEFFICIENTS", "UP_AXES", "Camera", "intrinsics", "look_at", "orbit", "pinhole_intrinsics", "turntable"]
-
 Float64 = NDArray[np.float64]
 
 UP_AXES: Mapping[str, tuple[float, float, float]] = MappingProxyType({"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)})
@@ -33,15 +31,14 @@ UNDISTORTION = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)  # 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A camera at a place: a pinhole, and the distortion of its lens if it has any.
+    """A pinhole camera with a pose, and the distortion of its lens if it has any.
 
     Attributes:
         intrinsics: ``(3, 3)`` float64, in pixels: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
         world_from_camera: ``(4, 4)`` float64 rigid pose; its columns are right, down, forward and the eye.
         width: of the image, in pixels.
         height: of the image, in pixels.
-        distortion: k1, k2, p1, p2, k3, k4, k5, k6 of OpenCV's model, or the first of them; the rest are zero. If all
-            are, it is ``()``.
+        distortion: the first of k1, k2, p1, p2, k3, k4, k5, k6 of OpenCV's model; ``()`` if all are zero.
 
     Raises:
         ValueError: a matrix has another shape, type or form, the image has no pixels, or a coefficient is not finite.
@@ -113,11 +110,9 @@ class Camera:
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
         """The eye ``(3,)`` and unit directions ``(H, W, 3)`` through the pixels' centres, in world coordinates.
 
-        Args:
-            dtype: of both; they are worked out in float64 and rounded once.
-            device: where to.
+        Both are computed in float64 and rounded once to ``dtype``.
         """
-        # Metal has no float64: there, the work is done on the CPU.
+        # Metal has no float64: its rays are computed on the CPU.
         place = "cpu" if torch.device(device).type == "mps" else device
         pose = self.world_from_camera.to(place)
         directions = torch.nn.functional.normalize(self.sight_lines(device=place), dim=-1) @ pose[:3, :3].T
@@ -140,11 +135,7 @@ class Camera:
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Where points ``(..., 3)`` fall in the image: pixels ``(..., 2)`` and depths z ``(...,)`` along the axis.
 
-        Both are float64, on the points' device. A pixel means something only where z > 0: what lies behind the
-        camera is not in the picture.
-
-        Raises:
-            ValueError: the points are not ``(..., 3)``.
+        Both are float64, on the points' device. Pixels are meaningless where z ≤ 0, behind the camera.
         """
         from kornia.geometry.camera import project_points
 
@@ -161,10 +152,10 @@ class Camera:
         return pixels.reshape(*points.shape[:-1], 2), seen[..., 2]
 
     def in_view(self, points: Float64) -> tuple[Float64, Float64, NDArray[np.bool_]]:
-        """Pixels ``(N, 2)`` and depths ``(N,)`` of points ``(N, 3)``, and which of them are in the picture ``(N,)``.
+        """Pixels ``(N, 2)`` and depths ``(N,)`` of points ``(N, 3)``, and a mask ``(N,)`` of those in the picture.
 
-        Far outside the image the polynomials of a distorted lens turn back, and would bring points of its surroundings
-        into it; so a point counts as inside only if its ray is among those of the image.
+        The polynomials of a distorted lens turn back far outside the image. So a point is inside only if its ray is
+        within those of the image.
         """
         seen = (points - self.eye.numpy()) @ self.world_from_camera[:3, :3].numpy()
         depths = seen[:, 2]
@@ -181,7 +172,7 @@ class Camera:
         return pixels, depths, inside
 
     def slopes_at(self, pixels: Float64) -> Float64:
-        """Where pixels ``(N, 2)`` look, with the lens undone: x / z and y / z in camera coordinates ``(N, 2)``."""
+        """Undistorted slopes x / z and y / z in camera coordinates ``(N, 2)`` of pixels ``(N, 2)``."""
         matrix, lens = self.for_opencv
         if of_opencv_4 := getattr(cv2, "undistortPointsIter", None):  # whose undistortPoints stops after five steps
             found = of_opencv_4(pixels[:, None], matrix, lens, None, None, UNDISTORTION)
@@ -190,7 +181,7 @@ class Camera:
         return np.asarray(found, np.float64).reshape(-1, 2)
 
     def pixels_at(self, slopes: Float64) -> Float64:
-        """The pixels ``(N, 2)`` that look along slopes ``(N, 2)``: the inverse of `slopes_at`."""
+        """The pixels ``(N, 2)`` of slopes ``(N, 2)``: the inverse of `slopes_at`."""
         if not self.distortion:  # an affine map, ten times as fast as OpenCV's
             fx, fy, cx, cy = self.fx_fy_cx_cy
             return slopes * (fx, fy) + (cx, cy)
@@ -202,17 +193,17 @@ class Camera:
 
     @property
     def for_opencv(self) -> tuple[Float64, Float64]:
-        """Matrix ``(3, 3)`` and coefficients ``(8,)`` as OpenCV takes them."""
+        """Matrix ``(3, 3)`` and coefficients ``(8,)`` for OpenCV."""
         coefficients = np.zeros(len(COEFFICIENTS))
         coefficients[: len(self.distortion)] = self.distortion
         return self.intrinsics.cpu().numpy(), coefficients
 
     def pinhole(self) -> Camera:
-        """What is left of the camera without the distortion of its lens."""
+        """The camera without the distortion of its lens."""
         return replace(self, distortion=())
 
     def moved(self, similarity: Similarity) -> Camera:
-        """The same camera in unit-sphere coordinates: it sees the moved world in the same pixels."""
+        """The same camera in unit-sphere coordinates."""
         pose = self.world_from_camera.clone()
         pose[:3, 3] = torch.from_numpy(similarity.to_unit(self.eye.cpu().numpy()))
         return replace(self, world_from_camera=pose)
@@ -224,16 +215,13 @@ class Camera:
         return replace(self, intrinsics=matrix, height=rows)
 
     def fits(self, width: int, height: int) -> bool:
-        """Whether an image of that size may show the same view: both sides by one factor, but for rounding."""
+        """Whether an image of that size may show the same view: both sides scaled by one factor, but for rounding."""
         return abs(self.height * width / self.width - height) < 1
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view in other pixels; where the aspect ratio changes, they are no longer square.
+        """The same view in other pixels, which are not square if the aspect ratio changes.
 
-        Corners, not pixel centres, stay where they are: x becomes ``(x + 0.5) · width / self.width − 0.5``.
-
-        Raises:
-            ValueError: ``width`` or ``height`` is less than one pixel.
+        Corners, not pixel centres, stay: x becomes ``(x + 0.5) · width / self.width − 0.5``.
         """
         sx, sy = width / self.width, height / self.height
         scale = self.intrinsics.new_tensor([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
@@ -246,16 +234,7 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
 
 
 def pinhole_intrinsics(fov: float, width: int, height: int) -> Tensor:
-    """The ``(3, 3)`` matrix of square pixels and an axis through the middle of the image.
-
-    Args:
-        fov: full vertical angle of view, degrees.
-        width: of the image, in pixels.
-        height: of the image, in pixels.
-
-    Raises:
-        ValueError: ``fov`` is not between 0 and 180.
-    """
+    """The ``(3, 3)`` matrix of square pixels and an axis through the middle; ``fov`` is vertical, in degrees."""
     if not 0 < fov < 180:
         raise ValueError(f"fov={fov}: expected degrees between 0 and 180")
     focal = height / 2 / math.tan(math.radians(fov) / 2)
@@ -274,10 +253,10 @@ def look_at(
     """A camera at ``eye`` with ``target`` in the middle of its image.
 
     Args:
-        eye: ``(3,)`` where it stands.
-        target: ``(3,)`` what it looks at.
-        up: ``(3,)`` what is up in the image. Looking straight along it, the image's right is +x (or +y, if that is
-            the direction of view).
+        eye: ``(3,)`` position of the camera.
+        target: ``(3,)`` point in the middle of the image.
+        up: ``(3,)`` direction that is up in the image. If the view is along it, the image's right is +x (or +y, if the
+            view is along x).
         fov: full vertical angle of view, degrees.
         width: of the image, in pixels.
         height: of the image, in pixels.
@@ -311,10 +290,10 @@ def orbit(
     margin: float = 0.94,
     zoom: float = 1.0,
 ) -> Camera:
-    """A camera on a sphere around the middle of ``points``, as near as it can be with all of them in view.
+    """A camera on a sphere around the middle of ``points``, as near as possible with all of them in view.
 
     Args:
-        points: ``(N, 3)`` what to look at; the corners of a box will do.
+        points: ``(N, 3)``; the corners of a box are enough.
         azimuth: degrees around the up axis, counter-clockwise from the front (+z for ``up="y"``, −y for ``up="z"``).
         elevation: degrees above the horizon, from −90 (from below) to 90 (from above).
         up: "y" or "z", the axis that points up.
@@ -322,7 +301,7 @@ def orbit(
         width: of the image, in pixels.
         height: of the image, in pixels.
         margin: share of the image that the points may fill.
-        zoom: how much larger than that the middle of the image is drawn, from the same place.
+        zoom: magnification from the same place.
 
     Raises:
         ValueError: an argument is out of its range, or the points are not ``(N, 3)``, not finite or all the same.
@@ -344,9 +323,9 @@ def turntable(
     margin: float = 0.94,
     zoom: float = 1.0,
 ) -> list[Camera]:
-    """Cameras once around ``points``, evenly spaced, all at the distance of the one that must stand furthest.
+    """Cameras evenly spaced on a circle around ``points``, from ``azimuth`` on, at the largest distance of any `orbit`.
 
-    The first stands at ``azimuth``; the next after the last would stand there again. Other arguments as for `orbit`.
+    Other arguments as for `orbit`.
 
     Raises:
         ValueError: ``frames`` is not positive, or as for `orbit`.
@@ -378,7 +357,7 @@ def turntable(
 
 
 def _orbit_axes(azimuth: float, elevation: float, up: str) -> tuple[Tensor, Tensor]:
-    """Right and forward of a camera that looks at the middle of its orbit; at the poles too."""
+    """Right and forward of a camera that looks at the middle of its orbit, also at the poles."""
     if up not in UP_AXES:
         raise ValueError(f"up={up!r}: expected 'y' or 'z'")
     if not -90 <= elevation <= 90:

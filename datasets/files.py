@@ -1,4 +1,4 @@
-"""Files as the readers of all rooms open them: JSON, NumPy arrays and images, and one line about what is wrong."""
+"""Files of all readers: JSON, NumPy arrays, images, and one-line messages about what is wrong."""
 
 from __future__ import annotations
 
@@ -25,44 +25,24 @@ from numpy.typing import NDArray
 from ..neural_fields import InputError
 from ..neural_fields.backend.files import damage
 
-__all__ = [
-    "DAMAGED_ARRAYS",
-    "decode_image",
-    "finite_number",
-    "numeric",
-    "read_arrays",
-    "read_image",
-    "read_json",
-    "read_rgb",
-    "readable",
-    "reader",
-    "rgb_and_alpha",
-    "unit_range",
-]
-
 P = TypeVar("P", bound="str | Path")
 A = ParamSpec("A")
 R = TypeVar("R")
 
-# An archive may hold this many times its own bytes and more than MODEST, and no more: points do not shrink so much.
+# An array of an archive may have MODEST bytes, or MOST_UNPACKED times those of the archive.
 MOST_UNPACKED, MODEST = 200, 256 << 20
 
 DAMAGED_ARRAYS = (ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""What NumPy's loaders raise on files that are not whole, or not theirs."""
+"""Errors of NumPy's loaders on damaged and foreign files."""
+
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".npz")
 
 
 @contextmanager
 def readable(path: Path, *, missing: str = "check the path") -> Iterator[None]:
-    """A block that reads ``path``: what the disc refuses, or the reader trips over, becomes one line.
+    """A block that reads ``path``: any error becomes an `InputError` of one line, and libraries print nothing.
 
-    Nothing is said but that: no warnings, and nothing that a library prints.
-
-    Args:
-        path: the file, which the message names.
-        missing: what to do if there is no such file.
-
-    Raises:
-        InputError: the block raised anything that is no `InputError`.
+    ``missing`` says what to do if there is no such file.
     """
     with damage(path, "export it again"), _silence:
         try:
@@ -76,10 +56,9 @@ def readable(path: Path, *, missing: str = "check the path") -> Iterator[None]:
 
 
 class _Silence:
-    """A block in which what libraries print to stderr is lost: OpenCV and libpng do on damaged images.
+    """A block in which stderr is discarded: OpenCV and libpng print to it on damaged images.
 
-    They write to the file descriptor, so that of the process is turned away; by the first thread that comes in, until
-    the last one leaves.
+    They write to the file descriptor of the process. The first thread that enters redirects it, the last one restores.
     """
 
     def __init__(self) -> None:
@@ -89,7 +68,7 @@ class _Silence:
         with self._lock:
             self._inside += 1
             if self._inside == 1:
-                with suppress(OSError):  # there is none
+                with suppress(OSError):  # no stderr
                     self._kept = os.dup(2)
                     sink = os.open(os.devnull, os.O_WRONLY)
                     os.dup2(sink, 2)
@@ -108,7 +87,7 @@ _silence = _Silence()
 
 
 def reader(read: Callable[Concatenate[P, A], R]) -> Callable[Concatenate[P, A], R]:
-    """Make a function that reads the file of its first argument refuse it in one line; see `readable`."""
+    """Decorate a function that reads the file of its first argument with `readable`."""
 
     @functools.wraps(read)
     def reading(path: P, *args: A.args, **kwargs: A.kwargs) -> R:
@@ -119,15 +98,7 @@ def reader(read: Callable[Concatenate[P, A], R]) -> Callable[Concatenate[P, A], 
 
 
 def read_json(path: Path, *, missing: str = "check the path") -> Any:
-    """What a JSON file in UTF-8 holds.
-
-    Args:
-        path: the file.
-        missing: see `readable`.
-
-    Raises:
-        InputError: the file cannot be read, or is no JSON.
-    """
+    """The content of a JSON file in UTF-8; see `readable` for ``missing``."""
     with readable(path, missing=missing):
         data = path.read_bytes()
     try:
@@ -137,15 +108,7 @@ def read_json(path: Path, *, missing: str = "check the path") -> Any:
 
 
 def finite_number(value: Any, named: str) -> float:
-    """A number of a JSON file.
-
-    Args:
-        value: what stands there.
-        named: file and field, as the beginning of the message.
-
-    Raises:
-        InputError: it is no finite number.
-    """
+    """A finite number of a JSON file; ``named`` are file and field, for messages."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{named}: {value!r}; expected a finite number")
     return float(value)
@@ -154,17 +117,12 @@ def finite_number(value: Any, named: str) -> float:
 def read_arrays(
     path: Path, choose: Callable[[list[str]], Iterable[str]] = lambda names: names
 ) -> NDArray[Any] | dict[str, NDArray[Any]]:
-    """The array of an NPY file, or the arrays of an NPZ archive by their names.
+    """The array of an NPY file, or the arrays of an NPZ archive by name, of those that ``choose`` returns.
 
-    Args:
-        path: the file; its content says which of both it is.
-        choose: of the names in an archive, those that are to be read; may raise its own InputError.
-
-    Raises:
-        InputError: the file cannot be read, is damaged, or holds Python objects.
+    The content decides which of both the file is.
     """
     named = f"{path}"
-    with readable(path), path.open("rb") as file:  # by itself np.load leaves damaged files open
+    with readable(path), path.open("rb") as file:  # np.load alone leaves damaged files open
         try:
             if file.read(6) == b"\x93NUMPY":
                 # Mapped first: that fails where the file is shorter than its head says, before anything is allocated.
@@ -188,7 +146,7 @@ def read_arrays(
 
 
 def _check_member(archive: zipfile.ZipFile | None, name: str, path: Path) -> None:
-    """Refuse an array that says it is larger than what is packed, or what can be believed of so small a file."""
+    """Refuse an array whose header claims more than is packed, or far more than the size of the file allows."""
     assert archive is not None, "an archive that is open"
     packed = archive.getinfo(name if name in archive.namelist() else f"{name}.npy")
     if packed.file_size > max(MODEST, MOST_UNPACKED * path.stat().st_size):
@@ -196,7 +154,7 @@ def _check_member(archive: zipfile.ZipFile | None, name: str, path: Path) -> Non
     with archive.open(packed) as file:
         version = np.lib.format.read_magic(file)
         if version[0] > 2:
-            return  # names of columns that are not ASCII: no array of ours, and `numeric` will say so
+            return  # names of columns that are not ASCII, which `numeric` refuses
         head = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
         shape, _, kind = head(file)
         if not kind.hasobject and math.prod(shape) * kind.itemsize > packed.file_size:
@@ -204,22 +162,14 @@ def _check_member(archive: zipfile.ZipFile | None, name: str, path: Path) -> Non
 
 
 def numeric(array: NDArray[Any], named: str) -> NDArray[Any]:
-    """The array, if it holds numbers.
-
-    Raises:
-        InputError: it holds anything else; ``named`` is the beginning of the message.
-    """
+    """The array, if it holds numbers; else an InputError that begins with ``named``."""
     if array.dtype.kind not in "fiu":
         raise InputError(f"{named}: type {array.dtype}; expected numbers")
     return array
 
 
 def read_image(path: Path) -> NDArray[Any]:
-    """An image file ``(H, W)`` or ``(H, W, C)`` as it is stored; see `decode_image`.
-
-    Raises:
-        InputError: the file is missing, damaged or no image.
-    """
+    """An image file ``(H, W)`` or ``(H, W, C)`` as stored; see `decode_image`."""
     with readable(path):
         data = path.read_bytes()
     try:
@@ -230,11 +180,7 @@ def read_image(path: Path) -> NDArray[Any]:
 
 
 def read_rgb(path: Path) -> tuple[NDArray[Any], NDArray[Any] | None]:
-    """A picture of 8 or 16 bits → its colours ``(H, W, 3)`` as stored, and its opacity ``(H, W)`` if it has any.
-
-    Raises:
-        InputError: the file is missing, damaged or no such picture.
-    """
+    """A picture of 8 or 16 bits → its colours ``(H, W, 3)`` as stored, and its opacity ``(H, W)`` if it has any."""
     stored = read_image(path)
     if stored.dtype not in (np.uint8, np.uint16) or stored.shape[2:] not in ((), (1,), (3,), (4,)):
         raise InputError(f"{path}: {stored.dtype} of shape {stored.shape}; expected a picture with 8 or 16 bits")
@@ -244,13 +190,11 @@ def read_rgb(path: Path) -> tuple[NDArray[Any], NDArray[Any] | None]:
 def decode_image(data: bytes) -> NDArray[Any]:
     """The bytes of an image file → ``(H, W)``, ``(H, W, 3)`` RGB or ``(H, W, 4)`` RGBA, with the bits of the file.
 
-    How the camera was held (EXIF) is not asked: cameras and texture coordinates belong to the pixels as stored.
-
-    Raises:
-        ValueError: it is no image, or of a kind that is not read.
+    EXIF orientations are ignored: cameras and texture coordinates belong to the pixels as stored. A ValueError says
+    that the bytes are no known image.
     """
     _check_pixels(data)
-    # imread would not say why it fails, and has trouble with names that are not ASCII.
+    # imread gives no reason for a failure, and has trouble with names that are not ASCII.
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     except cv2.error:
@@ -260,7 +204,7 @@ def decode_image(data: bytes) -> NDArray[Any]:
         if stored.ndim == 3 and stored.shape[2] in (3, 4):  # OpenCV: blue first
             stored[..., :3] = stored[..., 2::-1].copy()
         return stored
-    import imageio.v3 as iio  # here: loading it takes a fifth of a second, and what OpenCV does not know (TGA) is rare
+    import imageio.v3 as iio  # here: loading it takes a fifth of a second, and formats unknown to OpenCV are rare
 
     with suppress(ImportError):
         import pillow_heif
@@ -268,23 +212,19 @@ def decode_image(data: bytes) -> NDArray[Any]:
         pillow_heif.register_heif_opener()
     try:
         return np.asarray(iio.imread(data, plugin="pillow"))
-    except Exception as error:  # Pillow's readers raise whatever they trip over
+    except Exception as error:  # Pillow's readers raise anything
         raise ValueError("not an image that can be read") from error
 
 
 def _check_pixels(data: bytes) -> None:
-    """Refuse an image whose header claims far more pixels than its bytes can hold, before they are allocated.
-
-    Raises:
-        ValueError: it has more than 32 million pixels, and more than 50 for each byte.
-    """
+    """Refuse an image of more than 32 million pixels and more than 50 for each byte, before they are allocated."""
     width = height = 0
     if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) > 24:
         width, height = struct.unpack_from(">II", data, 16)
     elif len(data) > 8:
         from PIL import Image
 
-        with suppress(Exception), warnings.catch_warnings():  # Pillow's readers raise whatever they trip over
+        with suppress(Exception), warnings.catch_warnings():  # Pillow's readers raise anything
             warnings.simplefilter("ignore")
             with Image.open(io.BytesIO(data)) as image:
                 width, height = image.size
@@ -293,7 +233,7 @@ def _check_pixels(data: bytes) -> None:
 
 
 def rgb_and_alpha(stored: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any] | None]:
-    """The colours ``(H, W, 3)`` of what `decode_image` gives, grey as RGB, and its opacity ``(H, W)`` if it has any."""
+    """The colours ``(H, W, 3)`` of an image of `decode_image`, and its opacity ``(H, W)`` if it has any."""
     planes = stored.reshape(*stored.shape[:2], -1)
     colors = 3 if planes.shape[2] > 2 else 1
     rgb = np.ascontiguousarray(np.broadcast_to(planes[..., :colors], (*planes.shape[:2], 3)))
@@ -301,7 +241,26 @@ def rgb_and_alpha(stored: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any] | No
 
 
 def unit_range(stored: NDArray[Any]) -> NDArray[np.float32]:
-    """Whole numbers of b bits as shares of the largest, 2^b − 1; floating-point numbers are cut to [0, 1]."""
+    """Integers of b bits over the largest, 2^b − 1; floating-point numbers are clipped to [0, 1]."""
     if np.issubdtype(stored.dtype, np.integer):
         return stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
     return stored.astype(np.float32).clip(0, 1)
+
+
+def is_depth_file(path: str | Path) -> bool:
+    """Whether a file is a depth map by its name, or, of NPY and NPZ, by the shape of its array.
+
+    A two-dimensional array with at most 12 columns is a table of points, and no depth map.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".npy", ".npz") or not path.is_file():
+        return suffix in DEPTH_SUFFIXES[:3]
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        if suffix == ".npy":
+            return array.ndim == 3 or (array.ndim == 2 and array.shape[1] > 12)
+        with array:
+            return "points" not in array and len(array.files) > 0
+    except (OSError, *DAMAGED_ARRAYS):
+        return False  # its reader will report the error

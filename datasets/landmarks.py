@@ -11,19 +11,14 @@ from ..neural_fields import InputError
 from ..neural_fields.backend.files import write_whole
 from .files import readable
 
-__all__ = ["read_landmarks", "write_landmarks"]
-
 Float64 = NDArray[np.float64]
 
 
 def read_landmarks(path: str | Path) -> tuple[Float64, Float64]:
     """Pairs of points from a text file, ``(P, 3)`` each, in the input coordinates of either shape.
 
-    A line has six numbers, x y z of the first shape and x y z of the second, with spaces or commas between them; what
-    follows a # is a comment.
-
-    Raises:
-        InputError: there is no such file, it has no pairs, or a line is no six finite numbers.
+    A line has six numbers, x y z of the first shape and x y z of the second, separated by spaces or commas; a comment
+    begins with #.
     """
     path = Path(path)
     with readable(path):
@@ -47,16 +42,7 @@ def read_landmarks(path: str | Path) -> tuple[Float64, Float64]:
 
 
 def write_landmarks(path: str | Path, before: ArrayLike, after: ArrayLike) -> None:
-    """Write pairs of points as `read_landmarks` reads them; a file without any has its heading alone.
-
-    Args:
-        path: a text file, replaced as a whole.
-        before: ``(P, 3)`` in the input coordinates of the first shape.
-        after: ``(P, 3)``, the same points of the second.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write pairs of points ``(P, 3)`` of two shapes, in their input coordinates, for `read_landmarks`."""
     pairs = np.concatenate([np.asarray(side, np.float64).reshape(-1, 3) for side in (before, after)], axis=1)
     lines = ["# x y z of one shape, x y z of the next", *(" ".join(f"{number:.9g}" for number in row) for row in pairs)]
     write_whole(path, "\n".join(lines) + "\n")

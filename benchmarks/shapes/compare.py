@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from mplicits.datasets.color_space import linear_to_srgb, srgb_to_linear
+from mplicits.neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from mplicits.pipelines.render.trace import Seen
 from numpy.typing import NDArray
 from torch import Tensor

@@ -1,13 +1,8 @@
-"""Clouds of many millions of points, in bounded memory: points of one voxel that face the same way become one.
+"""Clouds of many millions of points in bounded memory: points of one voxel with like normals become their mean.
 
-More points than a fit can look at are no reason to leave any out. Space is cut into voxels, and the points of a voxel
-with the same dominant normal direction (one of ±x, ±y, ±z) are replaced by their mean: what noise they have averages
-out, the two sides of a thin sheet and of a sharp edge stay apart, and where a scanner stood close, or scanned twice,
-weighs no more than elsewhere. A mean of points on a plane lies on that plane, so flat parts stay exactly where
-they are; a curved one moves by less than a tenth of the voxel squared times its curvature.
-
-The surface's own noise is wider than a voxel where points are many. So that its outskirts do not become
-points in their own right, voxels that follow each other along their normals' dominant axis count as one.
+The points of a voxel with the same dominant normal direction (one of ±x, ±y, ±z) are averaged, so the two sides of a
+thin sheet stay apart. Planes stay exactly; a curved surface moves by less than a tenth of the voxel squared times its
+curvature. Where noise is wider than a voxel, voxels that follow each other along that direction count as one.
 """
 
 from __future__ import annotations
@@ -23,9 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from .point_cloud import PointCloud, begins, color_scale, colors_from, normals_from, unit_rows, usable_rows
-from .readers.stream import CloudStream
-
-__all__ = ["Merging", "merge_cloud"]
+from .readers.columns import CloudStream
 
 Float64 = NDArray[np.float64]
 Keys = NDArray[np.int64]
@@ -33,12 +26,12 @@ Keys = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class MergeOptions:
-    """How points are gathered in voxels."""
+    """How points are merged in voxels."""
 
-    rows: int = 1 << 19  # points read at once; with all that is worked out from them about 200 MiB
-    sample: int = 200_000  # points that the size of the voxels is estimated from
-    bits: int = 20  # of a cell number; a key of three and one of seven directions fills an int64
-    run: int = 16  # voxels that follow each other along a normal before the next counts as another surface
+    rows: int = 1 << 19  # points read at once; with intermediate arrays about 200 MiB
+    sample: int = 200_000  # points from which the size of the voxels is estimated
+    bits: int = 20  # of a cell number; three of them and one of seven directions fill an int64
+    run: int = 16  # largest number of voxels along a normal that are merged
     nowhere: int = 6  # the direction of a point without a normal
 
 
@@ -47,23 +40,14 @@ MERGE = MergeOptions()
 
 @dataclass(frozen=True)
 class Merging:
-    """What merging did to a cloud.
+    """Report of `merge_cloud`."""
 
-    Attributes:
-        read: points in the file.
-        kept: means that stand for them.
-        dropped_nan: points with a coordinate that is not finite.
-        dropped_isolated: points with next to none around them.
-        voxel: edge of the voxels, in input units.
-        seconds: how long it took, reading included.
-    """
-
-    read: int
-    kept: int
-    dropped_nan: int
+    read: int  # points in the file
+    kept: int  # means
+    dropped_nan: int  # points with a coordinate that is not finite
     dropped_isolated: int
-    voxel: float
-    seconds: float
+    voxel: float  # edge of the voxels, in input units
+    seconds: float  # reading included
 
     def summary(self) -> str:
         """One line for people."""
@@ -74,56 +58,31 @@ class Merging:
 
 
 class _Survey(NamedTuple):
-    """Where a cloud lies, and what it stores.
+    """The bounds of a cloud, and what it stores."""
 
-    Attributes:
-        low: ``(3,)`` lowest corner of the finite points.
-        extent: longest side of their box.
-        finite: how many there are.
-        sample: ``(M, 3)`` offsets of some of them, evenly chosen.
-        normals: whether there are any.
-        scale: the number of full brightness, see `color_scale`; None without colours.
-        read: how many points were read at all.
-    """
-
-    low: Float64
-    extent: float
-    finite: int
-    sample: Float64
-    normals: bool
-    scale: float | None
-    read: int
+    low: Float64  # (3,) lowest corner of the finite points
+    extent: float  # longest side of their box
+    finite: int  # number of finite points
+    sample: Float64  # (M, 3) offsets of some of them from ``low``, evenly chosen
+    normals: bool  # whether there are any
+    scale: float | None  # see `color_scale`; None without colours
+    read: int  # number of all points
 
 
 class _Groups(NamedTuple):
-    """Sums over the points of a voxel that face one way.
+    """Sums over the points of a voxel that face one way."""
 
-    Attributes:
-        keys: ``(n,)``, ascending: three cell numbers and a direction.
-        sums: ``(n, 7 or 10)``: how many, their offsets from the lowest corner, unit normals, colours if there are any.
-    """
-
-    keys: Keys
-    sums: Float64
+    keys: Keys  # (n,), ascending: three cell numbers and a direction
+    sums: Float64  # (n, 7 or 10): count, offsets from the lowest corner, unit normals, colours if there are any
 
 
 def merge_cloud(
     stream: CloudStream, limit: int, *, isolation: float | None = 30.0, voxel: float | None = None
 ) -> tuple[PointCloud, Merging] | None:
-    """At most ``limit`` points that stand for those of a stream, which is read twice.
+    """At most ``limit`` means of the points of a stream, which is read twice; None if all points coincide.
 
-    Args:
-        stream: the cloud.
-        limit: how many points may be left.
-        isolation: drop points with less than 1 / ``isolation`` of the usual number of points in the 27 voxels around
-            them: alone in their voxels they would weigh as much as the many of others. None keeps them.
-        voxel: edge of the voxels, in input units, if they are to be smaller than ``limit`` suggests.
-
-    Returns:
-        The merged cloud and what was done; None if there are no two places among the points.
-
-    Raises:
-        ValueError: ``limit`` is not positive.
+    Points with less than 1 / ``isolation`` of the usual number of points in the 27 voxels around them are dropped: they
+    would weigh as much as means of many. ``voxel`` is the edge in input units, if smaller than ``limit`` suggests.
     """
     if limit < 1:
         raise ValueError(f"limit={limit}: expected at least one")
@@ -180,8 +139,8 @@ def _survey(stream: CloudStream) -> _Survey:
 def _first_size(frame: _Survey, limit: int, *, each: int = 20) -> float:
     """Edge of the voxels of which a surface meets about half of ``limit``.
 
-    Cells with ``each`` points of the sample on average are all found, more or less; the number of cells that a surface
-    meets goes with one over their edge squared.
+    With ``each`` points of the sample per cell, nearly all cells of the surface are found. Their number is proportional
+    to one over their edge squared.
     """
     size, found = frame.extent, 1
     while found * each < len(frame.sample) and size > frame.extent / 2**MERGE.bits:
@@ -199,7 +158,7 @@ def _grouped(stream: CloudStream, frame: _Survey, size: float, limit: int) -> tu
         ones = np.ones((len(keys), 1))
         fresh = _summed(keys, np.concatenate((ones, offsets, normals, colors), axis=1))
         groups = _summed(np.concatenate((groups.keys, fresh.keys)), np.concatenate((groups.sums, fresh.sums)))
-        # Along the normals several of them will become one.
+        # Several of them become one along the normals.
         while len(groups.keys) > 4 * limit:
             groups, size = _coarser(groups), 2 * size
     return groups, size
@@ -274,11 +233,10 @@ def _along_normals(groups: _Groups) -> Float64:
 
 
 def _without_scraps(rows: Float64, size: float, *, share: float = 1 / 4, neighbors: int = 8) -> Float64:
-    """Give what is left over at the rims of noise, and between two directions, to what it is left over from.
+    """Add rows with few points, at the rims of noise and between two directions, to rows with many near them.
 
-    The mean of a few points is no worse than those points, but among means of many it would count as one of them.
-    Nothing is dropped: rows with less than ``share`` of the points of one within two voxels that faces the same way
-    are added to it.
+    Rows with less than ``share`` of the points of one within two voxels that faces the same way are added to it: a mean
+    of few points would weigh as much as a mean of many.
     """
     count = rows[:, 0]
     few = count < share * np.median(count)
@@ -303,7 +261,7 @@ def _without_scraps(rows: Float64, size: float, *, share: float = 1 / 4, neighbo
 
 
 def _without_isolated(groups: _Groups, factor: float) -> _Groups:
-    """Drop the voxels with too few points in and around them; see `merge_cloud`."""
+    """Drop voxels with too few points in and around them; see `merge_cloud`."""
     voxels = _summed(groups.keys >> 3, groups.sums[:, :1])
     counts = voxels.sums[:, 0]
     # A surface crosses about nine of the 27 voxels around one of its points.

@@ -1,4 +1,4 @@
-"""``PointCloud``: what a file holds before anything is cleaned or scaled, what its numbers mean, and its thinning."""
+"""``PointCloud``: points as a file holds them; the meaning of stored numbers; thinning by voxels."""
 
 from __future__ import annotations
 
@@ -9,37 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-__all__ = [
-    "PointCloud",
-    "begins",
-    "centred",
-    "color_scale",
-    "colors_from",
-    "middle_of",
-    "normals_from",
-    "select",
-    "spacing_of",
-    "spread",
-    "thin",
-    "unit_rows",
-    "usable_rows",
-    "voxel_representatives",
-]
-
 Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points in input coordinates, with whatever normals and colours came with them.
+    """Points in input coordinates, with normals and colours if there are any.
 
     Attributes:
-        points: ``(N, 3)`` float64, in input units; may still hold NaN and duplicates.
+        points: ``(N, 3)`` float64, in input units; may hold NaN and duplicates.
         normals: ``(N, 3)`` float32, not necessarily of unit length, or None.
         colors: ``(N, 3)`` float32 in [0, 1], or None.
-        source: what messages call this cloud; the file's path, say.
-        normals_source: whether the normals stood in the file or were computed from its faces.
-        reading: one line about what was read from a file, and what was not.
+        source: name in messages, such as the file's path.
+        normals_source: whether the normals are from the file, or were computed from its faces.
+        reading: one line about the columns of the file that were read or ignored.
 
     Raises:
         ValueError: an array has the wrong shape or a colour lies outside [0, 1].
@@ -79,13 +62,9 @@ def normals_from(values: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def color_scale(values: NDArray[Any]) -> float:
-    """The number that stands for full brightness: 1, 255 or 65535.
+    """The number of full brightness of stored colours ``(N, 3)``: 1 for fractions up to 2, or else 255 or 65535.
 
-    Bytes have 255. Other numbers are judged by all but the largest thousandth of an even sample, so that single strays
-    change nothing: fractions up to 2 have 1, and whole numbers the least of 255 and 65535 that holds them.
-
-    Args:
-        values: ``(N, 3)`` as files store them.
+    Bytes have 255. Other numbers are judged by a sample without its largest thousandth, which may be strays.
     """
     if values.dtype == np.uint8:
         return 255.0
@@ -98,12 +77,7 @@ def color_scale(values: NDArray[Any]) -> float:
 
 
 def colors_from(values: NDArray[Any], *, scale: float | None = None) -> NDArray[np.float32]:
-    """Colours as files store them → float32 in [0, 1]; a colour that is not a number becomes black.
-
-    Args:
-        values: the numbers.
-        scale: of full brightness, if these are only some of them; see `color_scale`.
-    """
+    """Colours as files store them, over ``scale`` (`color_scale`) → float32 in [0, 1]; black where not finite."""
     scale = color_scale(values) if scale is None else scale
     if values.dtype == np.uint8:
         return (values / np.float32(scale)).astype(np.float32)
@@ -137,25 +111,16 @@ def thin(cloud: PointCloud, max_points: int) -> PointCloud:
 
 
 def spread(points: Float64, max_points: int, *, steps: int = 12) -> NDArray[np.int64]:
-    """Indices, in order, of at most ``max_points`` points ``(N, 3)``, evenly spread.
+    """Ascending indices of at most ``max_points`` finite points ``(N, 3)``: one for each voxel.
 
-    They are those nearest the middle of the points of their voxel; the smallest voxel that leaves few enough is found
-    by bisection.
-
-    Args:
-        points: finite.
-        max_points: as many or fewer stay.
-        steps: halvings of the voxel's exponent; 12 leave it a few percent too large at most.
-
-    Raises:
-        ValueError: ``max_points`` is not positive.
+    The voxel is the smallest that leaves few enough, by bisection; 12 ``steps`` leave it a few percent too large.
     """
     if max_points < 1:
         raise ValueError(f"max_points={max_points}: expected at least one")
     if len(points) <= max_points:
         return np.arange(len(points))
     cells = _Cells(points)
-    # One voxel holds all at the top; at the bottom a million of them stand along a side.
+    # From a million voxels along a side to one for all points.
     low, high = -20.0, 1.0
     for _ in range(steps):
         middle = (low + high) / 2
@@ -167,7 +132,7 @@ def spread(points: Float64, max_points: int, *, steps: int = 12) -> NDArray[np.i
 
 
 def voxel_representatives(points: Float64, size: float) -> NDArray[np.int64]:
-    """Indices, in order, of one point ``(N, 3)`` per voxel: the one nearest the mean of its points."""
+    """Ascending indices of one point ``(N, 3)`` per voxel: the one nearest the mean of the voxel's points."""
     keys = _Cells(points).keys(size)
     order = np.argsort(keys, kind="stable")
     firsts = begins(keys[order])
@@ -182,29 +147,25 @@ def voxel_representatives(points: Float64, size: float) -> NDArray[np.int64]:
 
 
 def usable_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which points ``(N, 3)`` are usable ``(N,)``: finite, and near enough for the squares of their distances to be."""
+    """A mask ``(N,)`` of the points ``(N, 3)`` that are finite, and so are the squares of their distances."""
     with np.errstate(invalid="ignore"):
         return np.asarray((np.abs(points) < 1e150).all(axis=1))
 
 
 def centred(points: Float64) -> Float64:
-    """Points ``(N, 3)`` around the origin, as trees want them: over map coordinates they would lose digits.
-
-    The origin is the median by each coordinate of at most 10,000 of them; a mean would go away with one point that is
-    very far off, and take the digits of all others along.
-    """
+    """Points ``(N, 3)`` around the origin: trees over map coordinates would lose digits."""
     return points - middle_of(points)
 
 
 def middle_of(points: Float64) -> Float64:
-    """Where `centred` puts the origin ``(3,)``."""
+    """The median ``(3,)`` by each coordinate of at most 10,000 points; unlike the mean, strays do not move it far."""
     return np.median(points[:: 1 + len(points) // 10_000], axis=0)
 
 
 def spacing_of(points: Float64, *, share: float = 0.95, sample: int = 20_000) -> float:
-    """Distance to the nearest neighbour that ``share`` of the points ``(N, 3)`` stay below; 0 for a lone point.
+    """The ``share`` quantile of the distances of ``sample`` points to their nearest of all points ``(N, 3)``.
 
-    Measured at an even selection of ``sample`` points, among all of them.
+    0 for a single point.
     """
     if len(points) < 2:
         return 0.0
@@ -214,14 +175,14 @@ def spacing_of(points: Float64, *, share: float = 0.95, sample: int = 20_000) ->
 
 
 class _Cells:
-    """Points ``(N, 3)`` as cells of grids of any size, which all begin at the points' lowest corner."""
+    """Points ``(N, 3)`` in grids of any cell size, which begin at the points' lowest corner."""
 
     def __init__(self, points: Float64) -> None:
         self._offsets = (points - points.min(axis=0)).T.copy()  # (3, N)
         self.extent: Float64 = self._offsets.max(axis=1)
 
     def keys(self, size: float) -> NDArray[np.int64]:
-        """One whole number per point, ``(N,)``, the same within a voxel with sides of ``size``."""
+        """One integer per point, ``(N,)``, the same within a voxel with sides of ``size``."""
         sides = np.floor(self.extent / size).astype(np.int64) + 1
         x, y, z = (np.floor(axis / size).astype(np.int64) for axis in self._offsets)
         return (x * sides[1] + y) * sides[2] + z
@@ -232,5 +193,5 @@ class _Cells:
 
 
 def begins(ordered: NDArray[np.int64], step: int = 0) -> NDArray[np.bool_]:
-    """Where a number is not the one before it, or that and ``step``; true at the first."""
+    """A mask of the numbers that are not the one before plus ``step``; true at the first."""
     return np.concatenate(([True], ordered[1:] != ordered[:-1] + step))[: len(ordered)]

@@ -1,4 +1,4 @@
-"""``DepthCamera``: the lens of a depth sensor, from JSON files of two kinds, four numbers, or an angle of view."""
+"""``DepthCamera``: the lens of a depth sensor, from JSON, YAML, four numbers, or an angle of view."""
 
 from __future__ import annotations
 
@@ -18,24 +18,22 @@ from ...neural_fields import InputError
 from ..cameras import COEFFICIENTS, Camera, intrinsics, pinhole_intrinsics
 from ..files import finite_number, read_json, readable, reader
 
-__all__ = ["DepthCamera", "read_intrinsics"]
-
 Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """The lens of a `Camera` that may stand anywhere, with at most five coefficients, and the scale of its images.
+    """The lens of a depth camera without a pose, and the scale of its integer images.
 
     Attributes:
         width: of the depth image, in pixels.
         height: of the depth image, in pixels.
         fx: focal length in widths of a pixel.
         fy: focal length in heights of a pixel.
-        cx: where the axis meets the image, in pixels; the centre of the first pixel is at 0.
+        cx: principal point in pixels; the centre of the first pixel is at 0.
         cy: the same along the height.
         distortion: k1, k2, p1, p2, k3 of OpenCV's model; all zero for undistorted images.
-        depth_scale: how many steps of an integer depth image are one unit, or None if that is not known.
+        depth_scale: steps of an integer depth image per unit, or None if unknown.
 
     Raises:
         ValueError: a size, focal length or scale is not positive, or a number is not finite.
@@ -65,30 +63,17 @@ class DepthCamera:
 
     @classmethod
     def from_fov(cls, fov: float, width: int, height: int) -> DepthCamera:
-        """Square pixels, the axis through the middle of the image.
-
-        Args:
-            fov: full vertical angle of view, degrees.
-            width: of the image, in pixels.
-            height: of the image, in pixels.
-
-        Raises:
-            ValueError: ``fov`` is not between 0 and 180.
-        """
+        """Square pixels and an axis through the middle of the image; ``fov`` is the vertical angle in degrees."""
         (fx, _, cx), (_, fy, cy), _ = pinhole_intrinsics(fov, width, height).tolist()
         return cls(width, height, fx, fy, cx, cy)
 
     @classmethod
     def from_camera(cls, camera: Camera) -> DepthCamera:
-        """The pinhole of a `Camera`; its place and its distortion are left aside."""
+        """The pinhole of a `Camera`, without its pose and distortion."""
         return cls(camera.width, camera.height, *camera.fx_fy_cx_cy)
 
     def at(self, world_from_camera: Float64) -> Camera:
-        """The `Camera` with this lens in a pose ``(4, 4)``.
-
-        Raises:
-            ValueError: the pose is not rigid.
-        """
+        """The `Camera` with this lens and a rigid pose ``(4, 4)``."""
         pose = torch.from_numpy(np.asarray(world_from_camera, np.float64))
         matrix = intrinsics(self.fx, self.fy, self.cx, self.cy)
         return Camera(matrix, pose, self.width, self.height, self.distortion)
@@ -100,19 +85,19 @@ class DepthCamera:
 
     @property
     def pixel_angle(self) -> float:
-        """The slope from the middle of a pixel to that of the next: a pixel at depth z is this times z wide."""
+        """Width of a pixel at depth 1."""
         return 1 / math.sqrt(self.fx * self.fy)
 
     def rays(self) -> Tensor:
-        """``(H, W, 3)`` float64: the points at depth 1 that the pixels see, in camera coordinates."""
+        """``(H, W, 3)`` float64: the points of the pixels at depth 1, in camera coordinates."""
         return self.at(np.eye(4)).sight_lines()
 
     def unproject(self, depth: Float64) -> Float64:
-        """The points ``(H, W, 3)`` in camera coordinates that pixels with these depths z ``(H, W)`` see."""
+        """The points ``(H, W, 3)`` in camera coordinates of pixels with depths z ``(H, W)``."""
         return self.rays().numpy() * depth[..., None]
 
     def project(self, points: Float64) -> tuple[Float64, NDArray[np.bool_]]:
-        """Pixels ``(N, 2)`` where points ``(N, 3)`` in camera coordinates fall, and which of them are in the image."""
+        """Pixels ``(N, 2)`` of points ``(N, 3)`` in camera coordinates, and a mask of those in the image."""
         pixels, _, inside = self.at(np.eye(4)).in_view(points)
         return pixels, inside
 
@@ -122,17 +107,17 @@ def read_intrinsics(path: str | Path, *, size: tuple[int, int] | None = None) ->
     """Read the intrinsics of a depth camera.
 
     - JSON and YAML: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``, and if known ``depth_scale`` and the
-      distortion ``k1``, ``k2``, ``p1``, ``p2``, ``k3`` (ours, and Polycam's); or with a matrix in the place of the
-      four numbers, by rows or by columns: Open3D's intrinsics and camera parameters, Record3D's metadata, ROS's
-      camera information and OpenCV's calibration.
+      distortion ``k1``, ``k2``, ``p1``, ``p2``, ``k3`` (ours, and Polycam's); or with a matrix instead of the four
+      numbers, by rows or by columns: Open3D's intrinsics and camera parameters, Record3D's metadata, ROS's camera
+      information and OpenCV's calibration.
     - text: four numbers fx fy cx cy, or a matrix of 3 × 3 or more.
 
     Args:
         path: the file.
-        size: width and height of the images, where the file does not say.
+        size: width and height of the images, for files without them.
 
     Raises:
-        InputError: the file is missing or none of these, or a field is missing or not a number that it can be.
+        InputError: the file is missing or none of these, or a field is missing or impossible.
     """
     path = Path(path)
     fix = "give --intrinsics FX FY CX CY in pixels"
@@ -197,7 +182,7 @@ def _from_text(text: str, path: Path) -> Any:
 
 
 def _fields(known: dict[str, Any], content: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The fields of a file under our names, over those that are known already."""
+    """The fields of a file under the names of `DepthCamera`, over those that are known already."""
     if isinstance(content.get("intrinsic"), dict):
         content = {**content, **content["intrinsic"]}
     fields = {**known, **{_OTHER_NAMES.get(name, name): value for name, value in content.items()}}

@@ -1,7 +1,4 @@
-"""What makes a depth map fit to become a surface: edges without curtains, less noise, and normals.
-
-Everything here works on the grid of pixels. Where there is no reading, depth is NaN.
-"""
+"""Depth edges, noise, smoothing and normals on the pixel grid of a depth map; depth is NaN without reading."""
 
 from __future__ import annotations
 
@@ -13,18 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Noise",
-    "both_sides",
-    "edge_pixels",
-    "grid_normals",
-    "measure_noise",
-    "noise_of",
-    "smooth_depth",
-    "smoothing_radius",
-    "specks",
-]
-
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -33,21 +18,20 @@ Mask = NDArray[np.bool_]
 class SmoothingOptions:
     """How noise of depth maps is measured and smoothed."""
 
-    max_radius: int = 12  # pixels; beyond that smoothing rounds off what the sensor did see
-    blocks: tuple[int, int] = (2, 4)  # sides in pixels of the blocks over which noise may be alike
-    alike: float = 2.0  # averages of blocks have so many times the noise that they would have if it were independent
-    least_noise: float = 1e-4  # for readings without any noise, whose smoothing somebody asks for
+    max_radius: int = 12  # pixels; larger windows round off details
+    blocks: tuple[int, int] = (2, 4)  # sides in pixels of the blocks over which noise may be correlated
+    alike: float = 2.0  # noise of block means over that of independent noise, from which noise counts as correlated
+    least_noise: float = 1e-4  # lower bound of the relative noise of readings that are smoothed
 
 
 SMOOTHING = SmoothingOptions()
 
 
 def _breaks(depth: Float64, axis: int, *, pixel_angle: float, jump: float, incidence: float) -> Mask:
-    """Between which neighbours along ``axis`` the surface breaks off; one shorter than ``depth`` along it.
+    """Breaks of the surface between neighbours along ``axis``; one shorter than ``depth`` along it.
 
-    A step from z to z' is a break if it is longer than ``jump`` times the nearer depth (noise), plus what a plane
-    seen under ``incidence`` climbs in a pixel, plus one and a half times the step before or after it, whichever is
-    less and if it goes the same way: a steep floor goes on on both sides, a step does not.
+    A step is a break if it is longer than ``jump`` times the nearer depth, plus the step of a plane at ``incidence``,
+    plus 1.5 times the smaller of the steps before and after it, if these have its sign: a steep floor continues.
     """
     z = np.moveaxis(depth, axis, 1)
     step = np.diff(z, axis=1)
@@ -55,7 +39,7 @@ def _breaks(depth: Float64, axis: int, *, pixel_angle: float, jump: float, incid
     before = np.concatenate((nothing, step[:, :-1]), axis=1)
     after = np.concatenate((step[:, 1:], nothing), axis=1)
     way = np.sign(step)
-    # Where the reading on one side is missing, fmin takes the other; where both are, there is nothing to compare.
+    # fmin ignores a missing reading on one side.
     along = np.nan_to_num(np.fmin(before * way, after * way)).clip(min=0)
     nearer = np.fmin(z[:, :-1], z[:, 1:])
     slack = jump + pixel_angle * math.tan(math.radians(incidence))
@@ -63,16 +47,10 @@ def _breaks(depth: Float64, axis: int, *, pixel_angle: float, jump: float, incid
 
 
 def edge_pixels(depth: Float64, *, pixel_angle: float, jump: float = 0.01, incidence: float = 75.0) -> Mask:
-    """Pixels ``(H, W)`` on either side of a break of the surface: the rims, and what flies between them.
+    """Mask ``(H, W)`` of the pixels on either side of a break, where sensors mix near and far.
 
-    Sensors mix near and far there. At a sharp step one pixel on each side goes; of a ramp over several pixels, its
-    ends, which leaves between them what `grid_normals` shows to be seen edge-on.
-
-    Args:
-        depth: ``(H, W)``, NaN without reading.
-        pixel_angle: slope between the rays of neighbouring pixels (1 / focal length in pixels).
-        jump: relative step that noise alone may make.
-        incidence: degrees between view and normal up to which a plane is never a break, however noisy.
+    ``pixel_angle`` is the width of a pixel at depth 1, ``jump`` the largest relative step of noise, ``incidence`` the
+    angle of view in degrees up to which a plane has no breaks. Of a ramp over several pixels, only the ends are marked.
     """
     edges = np.zeros(depth.shape, bool)
     for axis in (0, 1):
@@ -83,7 +61,7 @@ def edge_pixels(depth: Float64, *, pixel_angle: float, jump: float = 0.01, incid
 
 
 def both_sides(steps: NDArray[Any], axis: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """What is known between neighbours along ``axis`` → the step after and the step before each of them, 0 at ends."""
+    """Steps between neighbours along ``axis`` → the step after and the step before each element, 0 at the ends."""
     sides = ([width if k == axis else (0, 0) for k in range(steps.ndim)] for width in ((0, 1), (1, 0)))
     after, before = (np.pad(steps, side) for side in sides)
     return after, before
@@ -92,9 +70,8 @@ def both_sides(steps: NDArray[Any], axis: int) -> tuple[NDArray[Any], NDArray[An
 def noise_of(depth: Float64, *, jump: float = 0.01) -> float:
     """Relative standard deviation of the readings, from second differences of inverse depth along both axes.
 
-    Inverse depth is linear on the image of any plane, so planes have none, however steep. Of independent Gaussian
-    noise σ, the second difference has √6 σ and the mean of its magnitude is √(2/π) of that. Those above
-    ``√6 · jump`` are edges and do not count. Quantised depth counts as noise, as it should.
+    Inverse depth is linear on the image of a plane. The second difference of independent Gaussian noise σ has the mean
+    magnitude √(2/π) √6 σ. Those above ``√6 · jump`` are edges and do not count; quantisation does.
     """
     inverse = 1 / depth
     found = []
@@ -108,33 +85,22 @@ def noise_of(depth: Float64, *, jump: float = 0.01) -> float:
 
 
 class Noise(NamedTuple):
-    """What is known of the noise of a depth map.
+    """The noise of a depth map."""
 
-    Attributes:
-        deviation: relative standard deviation of the readings.
-        radius: of the window in pixels that averages it away; see `smoothing_radius`.
-        patchy: whether it is alike over several pixels, as a Kinect's, whose steps of depth have plateaus between them.
-    """
-
-    deviation: float
-    radius: int
-    patchy: bool
+    deviation: float  # relative standard deviation of the readings
+    radius: int  # of the smoothing window in pixels; see `smoothing_radius`
+    patchy: bool  # whether it is correlated over several pixels, as that of a Kinect with its quantised steps
 
 
 def measure_noise(depth: Float64, *, pixel_angle: float, jump: float = 0.01) -> Noise:
-    """Measure noise pixel by pixel, and on averages of blocks, which shows whether it is alike over several pixels.
+    """Measure noise of pixels, and of means of blocks, which shows whether it is correlated over several pixels.
 
-    Noise that is independent from pixel to pixel is s times less in averages of s × s. Where it hardly gets less, the
-    second differences of pixels see little of it, and the averages count: as readings s pixels apart.
-
-    Args:
-        depth: ``(H, W)``, NaN without reading.
-        pixel_angle: slope between the rays of neighbouring pixels.
-        jump: see `noise_of`.
+    Independent noise is s times less in means of s × s pixels. Of correlated noise the means are measured, as readings
+    s pixels apart: second differences of pixels see little of it.
     """
     fine = noise_of(depth, jump=jump)
     found = Noise(fine, smoothing_radius(fine, pixel_angle), patchy=False)
-    if not found.radius:  # what is left is shape
+    if not found.radius:
         return found
     for side in SMOOTHING.blocks:
         coarse = noise_of(_block_means(depth, side), jump=jump)
@@ -147,7 +113,7 @@ def measure_noise(depth: Float64, *, pixel_angle: float, jump: float = 0.01) -> 
 
 
 def _block_means(depth: Float64, side: int) -> Float64:
-    """Harmonic means over blocks, since inverse depth is linear on planes; NaN where a reading is missing."""
+    """Harmonic means over blocks, because inverse depth is linear on planes; NaN where a reading is missing."""
     rows, columns = depth.shape[0] // side, depth.shape[1] // side
     blocks = (1 / depth[: rows * side, : columns * side]).reshape(rows, side, columns, side)
     return 1 / blocks.mean(axis=(1, 3))
@@ -157,8 +123,7 @@ def smoothing_radius(noise: float, pixel_angle: float, *, tilt: float = 3.0) -> 
     """The smallest window radius in pixels where relative noise tilts a fitted plane by less than ``tilt`` degrees.
 
     The slope of a plane through (2r + 1)² readings of noise σ one pixel apart has the standard deviation
-    ``σ √(3 / (r (r + 1) (2r + 1)²))``; a pixel is ``pixel_angle`` times the depth wide. 0 where single
-    differences do (σ / √2), and at most `max_radius`.
+    ``σ √(3 / (r (r + 1) (2r + 1)²))``. At radius 0 it is that of central differences, σ / √2.
     """
     limit = math.tan(math.radians(tilt)) * pixel_angle
     if noise / math.sqrt(2) <= limit:
@@ -177,22 +142,10 @@ def smooth_depth(
     color: NDArray[np.uint8] | None = None,
     contrast: float = 30.0,
 ) -> Float64:
-    """Average inverse depths over windows, weighted by distance, by likeness of depth, and by likeness of colour.
+    """Average inverse depths, which are linear on planes, by a joint bilateral filter; NaN where ``depth`` is.
 
-    OpenCV's joint bilateral filter; its guide is the logarithm of depth (coarse steps of the surface are kept) and,
-    if there is a picture, its brightness and its red-blue contrast. The weights depend on the guide alone, so
-    filtering readings and their mask alike and dividing leaves pixels without reading out. Inverse depth is what
-    is averaged because it is linear on planes.
-
-    Args:
-        depth: ``(H, W)``, NaN without reading.
-        radius: of the windows, in pixels; 0 returns ``depth``.
-        noise: relative standard deviation of the readings; see `noise_of`.
-        color: ``(H, W, 3)`` display RGB.
-        contrast: difference of brightness, of 255, that parts surfaces as much as a step of three σ.
-
-    Returns:
-        ``(H, W)``, NaN where ``depth`` is.
+    The guide is the logarithm of depth over three σ and, of a picture ``(H, W, 3)``, brightness and red-blue contrast
+    over ``contrast`` of 255. Readings and their mask are filtered alike and divided, which leaves missing ones out.
     """
     known = np.isfinite(depth)
     if radius == 0 or not known.any():
@@ -205,9 +158,9 @@ def smooth_depth(
         red, green, blue = np.moveaxis(color.astype(np.float32), 2, 0)
         guide[..., 1] = (0.299 * red + 0.587 * green + 0.114 * blue) / contrast
         guide[..., 2] = (red - blue) / contrast
-    inverse = np.where(known, 1 / relative, 0.0).astype(np.float32)  # the filter works in 32 bits; noise is far above
+    inverse = np.where(known, 1 / relative, 0.0).astype(np.float32)
     size, spread = 2 * radius + 1, radius / 1.5
-    # Plain builds of OpenCV lack its contributed modules; other packages may have put one of them here.
+    # Other packages may install a build of OpenCV without its contributed modules over ours.
     blend = cv2.ximgproc.jointBilateralFilter if hasattr(cv2, "ximgproc") else joint_bilateral
     weights = blend(guide, known.astype(np.float32), size, 1.0, spread)
     total = blend(guide, inverse, size, 1.0, spread)
@@ -218,17 +171,9 @@ def smooth_depth(
 def joint_bilateral(
     guide: NDArray[np.float32], image: NDArray[np.float32], size: int, spread: float, reach: float
 ) -> NDArray[np.float32]:
-    """OpenCV's ``ximgproc.jointBilateralFilter``: averages over discs, weighted by nearness in the guide and in place.
+    """OpenCV's ``ximgproc.jointBilateralFilter``, with a ``guide`` ``(H, W, C)`` and mirrored edges.
 
-    A pixel q at distance |q − p| ≤ size / 2 counts exp(−‖g(q) − g(p)‖₁² / (2 spread²) − |q − p|² / (2 reach²)); beyond
-    the edges the image is mirrored. OpenCV takes the exponential from a table.
-
-    Args:
-        guide: ``(H, W, C)``.
-        image: ``(H, W)``.
-        size: diameter of the disc in pixels, odd.
-        spread: σ of differences in the guide.
-        reach: σ of distances in pixels.
+    A pixel q at distance |q − p| ≤ size / 2 counts exp(−‖g(q) − g(p)‖₁² / (2 spread²) − |q − p|² / (2 reach²)).
     """
     radius, (rows, columns) = size // 2, image.shape
     near = np.pad(guide, ((radius, radius), (radius, radius), (0, 0)), mode="reflect")
@@ -250,9 +195,8 @@ def joint_bilateral(
 def grid_normals(points: Float64, *, pixel_angle: float, jump: float = 0.01, radius: int = 0) -> Float64:
     """Unit normals ``(H, W, 3)`` of a grid of points ``(H, W, 3)`` in camera coordinates, facing the camera.
 
-    The cross product of the tangents along columns and rows; each tangent is the mean of the steps to the
-    neighbours on either side (a central difference, one-sided at breaks; see `edge_pixels`), and with a ``radius``
-    the mean over the window. NaN where a tangent is missing.
+    Tangents are means of the steps to both neighbours without breaks (see `edge_pixels`), or over windows of a
+    ``radius``. NaN where a tangent is missing.
     """
     tangents = []
     for axis in (0, 1):
@@ -269,18 +213,18 @@ def grid_normals(points: Float64, *, pixel_angle: float, jump: float = 0.01, rad
 
 
 def _mean_step(step: Float64, usable: Mask, axis: int, radius: int) -> Float64:
-    """Mean of the usable steps that touch a pixel, or of its window; NaN where there is none."""
+    """Mean of the usable steps at a pixel, or in its window; NaN where there is none."""
     count, total = np.add(*both_sides(usable.astype(np.float64), axis)), np.add(*both_sides(step, axis))
     size = (2 * radius + 1, 2 * radius + 1)
     if radius:
         count = np.asarray(cv2.boxFilter(count, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT))
         total = np.asarray(cv2.boxFilter(total, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT))
-    count = count.round()[..., None]  # a box filter adds and subtracts, and leaves rounding where it should leave 0
+    count = count.round()[..., None]  # the box filter leaves rounding errors instead of 0
     return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
 
 
 def specks(kept: Mask, smallest: int) -> Mask:
-    """Pixels of ``kept`` ``(H, W)`` in pieces (joined along rows and columns) of fewer than ``smallest`` pixels."""
+    """Mask of the pixels of ``kept`` ``(H, W)`` in 4-connected pieces of fewer than ``smallest`` pixels."""
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(kept.astype(np.uint8), connectivity=4)
     small = statistics[:, cv2.CC_STAT_AREA] < smallest
     return kept & small[np.asarray(labels, np.int64)]

@@ -1,7 +1,4 @@
-"""Depth maps → an oriented coloured cloud, and what became of their pixels.
-
-`frame_cloud` takes one; `fuse_frames` joins several with poses, and drops what some of them see through.
-"""
+"""Depth maps → an oriented coloured cloud and a report: `frame_cloud` of one, `fuse_frames` of several with poses."""
 
 from __future__ import annotations
 
@@ -21,8 +18,6 @@ from ..clouds.readers.reading import MIN_POINTS
 from .cleaning import edge_pixels, grid_normals, measure_noise, smooth_depth, specks
 from .frame import RgbdFrame
 
-__all__ = ["DepthReport", "DepthSettings", "frame_cloud", "fuse_frames"]
-
 Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
@@ -32,11 +27,11 @@ Int64 = NDArray[np.int64]
 class FusionOptions:
     """How depth maps are joined."""
 
-    typical: float = 0.99  # share of the points that are nearer than what is called typical
-    stray: float = 1.5  # what is further away than so many times that makes everything else coarse
-    tolerance: float = 0.03  # of the depth: a point this much nearer than what a frame sees there is in its way
-    witnesses: int = 12  # frames that are asked about each point, so that long sequences take linear time
-    room: int = 2  # times as many points as will stay are kept until all frames have been asked about them
+    typical: float = 0.99  # share of the points nearer than the typical depth
+    stray: float = 1.5  # furthest over typical depth from which the report suggests --max-depth
+    tolerance: float = 0.03  # of the depth, by which a point is in front of a frame's surface, or on it
+    witnesses: int = 12  # frames that each point is projected into, for linear time
+    room: int = 2  # points that are kept for the vote, over those that stay
 
 
 FUSION = FusionOptions()
@@ -48,12 +43,11 @@ class DepthSettings:
 
     Attributes:
         max_depth: readings beyond it are dropped, in the unit of depth; None keeps them.
-        jump: step between neighbours, relative to depth, that noise may make; beyond it there is an edge.
-        max_incidence: degrees between the view and the normal beyond which a point is dropped: what is seen edge-on
-            is hardly measured, and curtains between near and far are.
-        smoothing: radius of the smoothing windows in pixels; None is as much as the noise of the readings asks for.
+        jump: largest step between neighbours, relative to depth, that is noise and no edge.
+        max_incidence: degrees between the view and the normal beyond which a point is dropped.
+        smoothing: radius of the smoothing windows in pixels; None derives it from the noise of the readings.
         smallest_piece: pieces of the map with a smaller share of its pixels than this are dropped.
-        max_points: of the whole cloud; more are thinned by voxels.
+        max_points: of the whole cloud, which is thinned by voxels.
 
     Raises:
         ValueError: a setting is out of its range.
@@ -81,44 +75,26 @@ class DepthSettings:
 
 @dataclass(frozen=True)
 class DepthReport:
-    """What became of the pixels of one or several depth maps.
+    """Report on the pixels of one or several depth maps; lengths are in the unit of the maps."""
 
-    Attributes:
-        frames: depth maps.
-        pixels: of all of them.
-        without_reading: pixels whose depth the sensor did not give.
-        out_of_range: pixels beyond ``max_depth``.
-        edges: pixels beside a break of the surface.
-        grazing: pixels seen edge-on, or too lonely for a normal.
-        specks: pixels in pieces too small to be a surface.
-        kept: points of the cloud.
-        noise: relative standard deviation of the readings, the median over the frames.
-        smoothing: radius of the smoothing windows in pixels, the largest over the frames.
-        nearest: the smallest depth of a point kept.
-        furthest: the largest one.
-        typical: the depth below which 99 % of them are; of several frames, the largest.
-        seen_through: points where other frames see free space.
-        thinned: points that others stand for, after thinning.
-    """
-
-    frames: int
-    pixels: int
+    frames: int  # number of depth maps
+    pixels: int  # of all maps
     without_reading: int
-    out_of_range: int
-    edges: int
-    grazing: int
-    specks: int
-    kept: int
-    noise: float
-    smoothing: int
-    nearest: float
-    furthest: float
-    typical: float
-    seen_through: int = 0
-    thinned: int = 0
+    out_of_range: int  # pixels beyond ``max_depth``
+    edges: int  # pixels beside a break of the surface
+    grazing: int  # pixels seen edge-on, or without a normal
+    specks: int  # pixels in pieces that are too small
+    kept: int  # points of the cloud
+    noise: float  # relative standard deviation of the readings, the median over the frames
+    smoothing: int  # radius of the smoothing windows in pixels, the largest over the frames
+    nearest: float  # smallest depth of a kept point
+    furthest: float  # largest depth of a kept point
+    typical: float  # 99 % quantile of the depths of kept points; of several frames, the largest
+    seen_through: int = 0  # points that other frames see through
+    thinned: int = 0  # points that were dropped by thinning
 
     def summary(self) -> str:
-        """A few lines for people; lengths are in the unit of the depth map."""
+        """The report in a few lines."""
         dropped = {
             "without a reading": self.without_reading,
             "beyond the largest depth": self.out_of_range,
@@ -142,13 +118,10 @@ class DepthReport:
 
 
 def frame_cloud(frame: RgbdFrame, settings: DepthSettings | None = None) -> tuple[PointCloud, DepthReport]:
-    """Make an oriented, coloured cloud of a depth map, in world coordinates.
+    """An oriented, coloured cloud of a depth map in world coordinates, and a report.
 
-    Depth edges are cut on both sides, the rest is smoothed as far as its noise asks for it, moved out along the
-    rays of the pixels, given normals that face the camera, and thinned by voxels.
-
-    Returns:
-        The cloud, and what became of the pixels.
+    Depth edges are cut on both sides. The rest is smoothed according to its noise, unprojected, and given normals that
+    face the camera.
 
     Raises:
         InputError: fewer than ten points are left.
@@ -164,7 +137,7 @@ def frame_cloud(frame: RgbdFrame, settings: DepthSettings | None = None) -> tupl
     if radius:
         depth = smooth_depth(np.where(edges, np.nan, depth), radius, noise=noise.deviation, color=frame.color)
     points = frame.camera.unproject(depth)
-    # The filter keeps some of the steps between plateaus; the mean of many tangents does not.
+    # The filter keeps some of the steps between plateaus; a mean of many tangents does not.
     window = radius if noise.patchy else radius // 2
     normals = grid_normals(points, pixel_angle=pixel_angle, jump=settings.jump, radius=window)
     facing = -(normals * points).sum(axis=2) / np.linalg.norm(points, axis=2)
@@ -208,22 +181,17 @@ def fuse_frames(
     tolerance: float = FUSION.tolerance,
     witnesses: int = FUSION.witnesses,
 ) -> tuple[PointCloud, DepthReport]:
-    """Join depth maps in world coordinates; one frame alone is fine.
+    """Join one or more depth maps in world coordinates → a cloud and a report.
 
-    Each frame becomes a cloud (see `frame_cloud`). A point of it is dropped if more of the other frames see through it
-    than see it: flying points, and what moved away. The rest is thinned by voxels, which also joins what several
-    frames saw.
+    Each frame becomes a cloud (see `frame_cloud`). A point is dropped if more of the other frames see through it than
+    see it: flying points, and things that moved. The rest is thinned by voxels.
 
     Args:
-        frames: with poses in one world, and depths in one unit, that of the poses. They are gone through twice, and
-            none is held longer than it is looked at: what reads its frames anew each time needs memory for one of
-            them, however many there are.
+        frames: with poses in one world, and depths in the unit of the poses. They are iterated twice and not held: an
+            iterable that reads its frames needs memory for one.
         settings: of the cleaning; ``max_points`` is for all frames together.
         tolerance: relative difference of depths up to which a frame sees the same point.
-        witnesses: how many other frames, evenly spread over the sequence, are asked about a frame's points.
-
-    Returns:
-        The cloud, and what became of the pixels.
+        witnesses: number of other frames, evenly spread over the sequence, that vote on a frame's points.
 
     Raises:
         InputError: there are no frames, nothing is left, or only some frames have colours.
@@ -235,7 +203,7 @@ def fuse_frames(
     if isinstance(frames, Iterator):
         raise ValueError("frames: an iterator, which ends after one pass; expected a list, or what begins anew")
     pool = _Pool(settings)
-    # `map` and not a loop over frames, whose variable would hold each of them until the next has been read.
+    # `map`, because the variable of a loop would hold a frame until the next has been read.
     reports = list(map(pool.add, frames))
     if not reports:
         raise InputError("frames: none given; name at least one depth map")
@@ -253,7 +221,7 @@ def fuse_frames(
 
 
 class _Pool:
-    """The points of the frames so far, and which frame each of them is from; never many more than will stay."""
+    """The points of the frames so far and the number of their frame, thinned to a multiple of those that stay."""
 
     def __init__(self, settings: DepthSettings) -> None:
         self.settings = settings
@@ -263,7 +231,7 @@ class _Pool:
         self.source, self.colored = "", False
 
     def add(self, frame: RgbdFrame) -> DepthReport:
-        """Take in the points of the next frame."""
+        """Add the points of the next frame."""
         colored = frame.color is not None
         if not self.frames:
             self.source, self.colored = frame.source, colored
@@ -292,7 +260,7 @@ def _witnesses(frames: int, limit: int) -> Int64:
 
 
 def _votes(points: Float64, owner: Int32, asked: Int64, tolerance: float, index: int, frame: RgbdFrame) -> Int64:
-    """What a frame has to say of the points ``(N, 3)`` of those frames that ask it, see `_verdict`; else 0."""
+    """Votes of a frame on the points ``(N, 3)`` of the frames that it is a witness of, see `_verdict`; else 0."""
     mine = np.flatnonzero((asked == index).any(axis=1)[owner])
     votes = np.zeros(len(points), np.int64)
     votes[mine] = _verdict(points[mine], frame, _nearest_around(frame.depth), tolerance)
@@ -302,13 +270,13 @@ def _votes(points: Float64, owner: Int32, asked: Int64, tolerance: float, index:
 def _nearest_around(depth: Float64) -> Float64:
     """The nearest depth among a pixel and its eight neighbours ``(H, W)``; 0 where one of them has no reading.
 
-    So that a surface seen at a slant, or the rim of a thing with something far behind it, is not seen through.
+    With it, slanted surfaces and rims in front of a far background are not seen through.
     """
     return np.asarray(cv2.erode(np.nan_to_num(depth, nan=0.0), np.ones((3, 3), np.uint8)), np.float64)
 
 
 def _verdict(points: Float64, frame: RgbdFrame, nearest: Float64, tolerance: float) -> Int64:
-    """Of each point ``(N, 3)`` in world coordinates: 1 if the frame sees through it, −1 if it sees it, else 0."""
+    """For each point ``(N, 3)`` in world coordinates: 1 if the frame sees through it, −1 if it sees it, else 0."""
     pixels, depths, inside = frame.view.in_view(points)
     index = np.flatnonzero(inside)
     u, v = np.rint(pixels[index]).astype(np.int64).T

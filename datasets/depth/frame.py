@@ -1,4 +1,4 @@
-"""``RgbdFrame``: a depth map, its lens, its colours and where it was seen from, each from its file."""
+"""``RgbdFrame``: a depth map with its lens, colours and pose, each from its file."""
 
 from __future__ import annotations
 
@@ -16,11 +16,9 @@ from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in
 from ..cameras import Camera
 from ..files import finite_number, read_json, readable, reader
-from ..views.formats.reading import read_cameras
+from ..views.images import read_cameras
 from .camera import DepthCamera, read_intrinsics
 from .images import fit_color, read_color, read_depth
-
-__all__ = ["PosedFrame", "RgbdFrame", "read_frame", "read_poses", "read_trajectory"]
 
 Float64 = NDArray[np.float64]
 PosedFrame = tuple[str | None, Float64, DepthCamera | None]
@@ -29,14 +27,14 @@ PosedFrame = tuple[str | None, Float64, DepthCamera | None]
 
 @dataclass(frozen=True, eq=False)
 class RgbdFrame:
-    """What a depth camera saw at one moment.
+    """A depth map, its lens, its picture and its pose.
 
     Attributes:
-        depth: ``(H, W)`` float64, z along the camera's axis; NaN where there is no reading.
+        depth: ``(H, W)`` float64, z along the camera's axis; NaN without reading.
         camera: its lens.
         color: ``(H, W, 3)`` uint8 display RGB, or None.
-        world_from_camera: ``(4, 4)`` float64 rigid pose in OpenCV's axes; by default the world is the camera's.
-        source: what messages call the frame.
+        world_from_camera: ``(4, 4)`` float64 rigid pose in OpenCV's axes; by default the identity.
+        source: name in messages.
 
     Raises:
         ValueError: an array has the wrong shape or type, or the lens is of another size than the depth map.
@@ -58,12 +56,12 @@ class RgbdFrame:
 
     @property
     def view(self) -> Camera:
-        """The camera where it stood."""
+        """The camera with its pose."""
         return self.camera.at(self.world_from_camera)
 
     @property
     def eye(self) -> Float64:
-        """``(3,)`` where the camera stood, in world coordinates."""
+        """``(3,)`` position of the camera, in world coordinates."""
         return self.world_from_camera[:3, 3]
 
 
@@ -81,8 +79,8 @@ def read_frame(
 
     Args:
         depth: PNG, TIFF, NPY or NPZ file; see `read_depth`.
-        camera: the lens; its size must be that of the map.
-        color: a picture from the same place, pixel on pixel.
+        camera: the lens, of the size of the map.
+        color: a picture that is registered to the map.
         world_from_camera: ``(4, 4)`` rigid pose; None is the camera's own coordinates.
         scale: numbers in the file per unit; None is the camera's ``depth_scale`` for integer images.
         inverse: whether the file holds inverse depths.
@@ -127,19 +125,12 @@ def read_poses(path: str | Path) -> list[PosedFrame]:
 
 
 def read_trajectory(path: str | Path) -> Float64:
-    """Read the poses of a text or JSON file; see `read_poses`.
-
-    Returns:
-        ``(F, 4, 4)``.
-
-    Raises:
-        InputError: the file is missing, or holds no poses.
-    """
+    """The poses ``(F, 4, 4)`` of a file; see `read_poses`."""
     return np.stack([pose for _, pose, _ in read_poses(path)])
 
 
 _EXPECTED = "no poses in it; expected a trajectory.log, TUM's poses, a transforms.json, or a folder of 4 × 4 matrices"
-_OPENGL = np.diag([1.0, -1, -1, 1])  # x right, y up, z backward: the axes of ARKit and of OpenGL
+_OPENGL = np.diag([1.0, -1, -1, 1])  # x right, y up, z backward: the axes of ARKit and OpenGL
 
 
 def _file_poses(path: Path) -> list[PosedFrame]:
@@ -209,10 +200,7 @@ def _from_quaternion(place: list[float], quaternion: list[float]) -> Float64:
 
 
 def _rigid(matrix: Any, named: str, axes: Float64 | None = None) -> Float64:
-    """A pose ``(4, 4)`` of ``(3, 4)`` or ``(4, 4)`` numbers; printed digits leave axes not quite orthonormal.
-
-    The nearest rotation (polar factor) is taken, as long as no number is off by more than 1e-3.
-    """
+    """A pose ``(4, 4)`` of ``(3, 4)`` or ``(4, 4)`` numbers: with the nearest rotation, if RᵀR is within 1e-3 of I."""
     try:
         pose = np.concatenate((np.asarray(matrix, np.float64), [[0, 0, 0, 1]]))[: max(4, len(matrix))]
     except (TypeError, ValueError) as error:

@@ -10,39 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
-from ..color_space import linear_to_srgb, srgb_to_linear
-from ..files import DAMAGED_ARRAYS, numeric, read_arrays, read_image, read_rgb, readable, reader
-
-__all__ = ["DEPTH_SCALE", "DEPTH_SUFFIXES", "fit_color", "is_depth_file", "read_color", "read_depth"]
+from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
+from ..files import DEPTH_SUFFIXES, numeric, read_arrays, read_image, read_rgb, readable, reader
 
 Float64 = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".npz")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 DEPTH_SCALE = 1000.0
-"""Steps of an integer depth image in one unit where nobody says how many: millimetres in a metre."""
+"""Steps of an integer depth image per unit by default: millimetres in a metre."""
 
-ASPECT = 0.01  # how far two aspect ratios may be apart and still show the same picture
-
-
-def is_depth_file(path: str | Path) -> bool:
-    """Whether a file is a depth map by its name, or, of NPY and NPZ, by the shape of what is in it.
-
-    A two-dimensional array with at most 12 columns is a table of points, and no depth map.
-    """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in (".npy", ".npz") or not path.is_file():
-        return suffix in DEPTH_SUFFIXES[:3]
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-        if suffix == ".npy":
-            return array.ndim == 3 or (array.ndim == 2 and array.shape[1] > 12)
-        with array:
-            return "points" not in array and len(array.files) > 0
-    except (OSError, *DAMAGED_ARRAYS):
-        return False  # whoever reads it will say what is wrong
+ASPECT = 0.01  # largest relative difference of the aspect ratios of one picture
 
 
 def read_depth(
@@ -59,14 +37,14 @@ def read_depth(
         path: PNG (16 bits), TIFF (16 bits or float), NPY, or NPZ with an array ``depth`` or a single array.
         scale: numbers in the file per unit: 1000 for millimetres, 5000 for the TUM benchmark. None is
             ``integer_scale`` for integers and 1 for floating-point numbers.
-        integer_scale: what the camera says of its integer images; None is `DEPTH_SCALE`.
-        inverse: whether the numbers are inverse depths (disparities), ``z = scale / number``; then None is 1.
-        saturates: whether the largest number of the type, 65535, and their like in other units are no readings, as
-            sensors write them; never so for inverse depths, whose largest number is the nearest.
+        integer_scale: of the camera's integer images; None is 1000.
+        inverse: whether the numbers are inverse depths (disparities), ``z = scale / number``; then ``scale`` is by
+            default 1.
+        saturates: whether the largest number of the type, 65535 and their like in other units are no readings. It is
+            ignored for inverse depths, whose largest number is the nearest.
 
     Returns:
-        ``(H, W)`` depth z along the camera's axis, in the unit that ``scale`` makes; NaN where there is no
-        reading (zero, negative, NaN, infinite, or saturated).
+        ``(H, W)`` depth z along the camera's axis; NaN without reading (zero, negative, NaN, infinite, saturated).
 
     Raises:
         InputError: the file is missing or damaged, has 8 bits or several channels, or no reading at all.
@@ -105,9 +83,9 @@ def _depth(path: Path, scale: float | None, integer_scale: float | None, *, inve
 
 
 def _saturated(numbers: NDArray[Any]) -> NDArray[np.bool_]:
-    """Where a sensor or a renderer has written its largest number: of 16 bits, of the type, or a far plane's.
+    """Mask of the largest numbers of sensors and renderers: of 16 bits, of the type, or a far plane's.
 
-    Of floating-point numbers these are 65535, that in metres, the largest half-precision number, and 1e9 and more.
+    Of floating-point numbers these are 65535, the largest half-precision number, both in metres, and 1e9 and more.
     """
     if numbers.dtype.kind == "f":
         return (numbers >= 1e9) | np.isin(numbers, np.array([65535, 65504, 65.535, 65.504], numbers.dtype))
@@ -116,11 +94,7 @@ def _saturated(numbers: NDArray[Any]) -> NDArray[np.bool_]:
 
 @reader
 def read_color(path: str | Path) -> Bytes:
-    """Read a colour picture → ``(H, W, 3)`` display RGB; grey becomes RGB, and transparency is left out.
-
-    Raises:
-        InputError: the file is missing, damaged or no picture.
-    """
+    """A colour picture → ``(H, W, 3)`` uint8 display RGB; grey becomes RGB, and transparency is ignored."""
     path = Path(path)
     if path.suffix.lower() not in COLOR_SUFFIXES:
         raise InputError(
@@ -131,16 +105,9 @@ def read_color(path: str | Path) -> Bytes:
 
 
 def fit_color(color: Bytes, size: tuple[int, int], *, source: str, resize: bool = False) -> Bytes:
-    """Check that a picture ``(H, W, 3)`` has the size of the depth map, or bring it to that size.
+    """The picture ``(H, W, 3)``, if it has the ``size`` (width, height) of the depth map; else an InputError.
 
-    Args:
-        color: display RGB.
-        size: width and height of the depth map.
-        source: what messages call the picture.
-        resize: whether to scale a picture of the same aspect ratio, in linear light.
-
-    Raises:
-        InputError: the sizes differ, and ``resize`` is off or the aspect ratios differ too.
+    With ``resize``, a picture of the same aspect ratio is scaled in linear light.
     """
     height, width = color.shape[:2]
     if (width, height) == size:

@@ -1,4 +1,4 @@
-"""Parts with sharp edges, as exact meshes: a box, a cylinder, a gear. What scans of machine parts are tried on."""
+"""Parts with sharp edges as exact meshes: a box, a cylinder, a gear."""
 
 from __future__ import annotations
 
@@ -9,24 +9,17 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PRISMS", "Prism", "box", "cylinder", "gear", "prism"]
-
 Float64 = NDArray[np.float64]
 Prism = tuple[Float64, NDArray[np.int64]]
 
-# Of no axis: marching cubes are exact on faces that lie along theirs.
+# Away from the axes: marching cubes are exact on faces along them.
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 
 
 def prism(outline: Float64, half_height: float) -> Prism:
-    """The solid over a polygon that is seen whole from the origin, turned away from the axes.
+    """The solid over a polygon ``(n, 2)``, star-shaped and counter-clockwise around the origin, turned by `TURN`.
 
-    Args:
-        outline: ``(n, 2)`` corners, counter-clockwise around the origin.
-        half_height: half the length along the axis.
-
-    Returns:
-        Vertices ``(2 n + 2, 3)`` and faces ``(4 n, 3)`` of a closed mesh, outward.
+    Vertices ``(2 n + 2, 3)`` and faces ``(4 n, 3)`` of a closed mesh, outward.
     """
     count = len(outline)
     corner, after = np.arange(count), np.roll(np.arange(count), -1)
@@ -49,14 +42,14 @@ def box(width: float = 1.0, depth: float = 0.7, height: float = 1.2) -> Prism:
 
 
 def cylinder(radius: float = 0.55, height: float = 1.2, *, sides: int = 512) -> Prism:
-    """A cylinder of so many sides: 512 of them are within radius · 2e-5 of a round one."""
+    """A cylinder with flat sides: 512 of them are within radius · 2e-5 of a round one."""
     angle = 2 * math.pi * np.arange(sides) / sides
     return prism(radius * np.column_stack((np.cos(angle), np.sin(angle))), height / 2)
 
 
 def gear(teeth: int = 12, *, root: float = 0.62, tip: float = 0.85, height: float = 0.44) -> Prism:
-    """A spur gear with straight flanks: edges that stand out, and edges that lie between teeth."""
-    # Of each tooth's turn: the gap, the flank, the tip and the other flank.
+    """A spur gear with straight flanks: convex edges, and concave ones between teeth."""
+    # As shares of a tooth's turn: the gap, the flank, the tip and the other flank.
     turn = np.arange(teeth)[:, None] + np.array([0.0, 0.22, 0.36, 0.64, 0.78])
     radius = np.broadcast_to([root, root, tip, tip, root], turn.shape).ravel()
     angle = 2 * math.pi * turn.ravel() / teeth

@@ -1,4 +1,4 @@
-"""Exact points of the zero set of a smooth field: sampled evenly, projected, closest; and damage to such clouds."""
+"""Points of the zero set of a smooth field: uniform samples, projections; noise and outliers."""
 
 from __future__ import annotations
 
@@ -10,19 +10,6 @@ from numpy.typing import NDArray
 
 from ...neural_fields import Field, Similarity
 from ..clouds.point_cloud import PointCloud, unit_rows
-
-__all__ = [
-    "add_isotropic_noise",
-    "add_noise",
-    "add_outliers",
-    "distinct_starts",
-    "feet_and_normals",
-    "jet_at",
-    "refine_closest",
-    "sample_sphere",
-    "sample_surface",
-    "sample_torus",
-]
 
 Float64 = NDArray[np.float64]
 
@@ -40,25 +27,20 @@ def sample_surface(
     """Sample ``count`` points of a field's zero set, evenly by area, with exact normals.
 
     Points uniform in the shell |f| < ``shell``·|∇f| are projected on the surface. A shell of half-width h holds
-    2h(1 + K h²/3) of volume per area, K being the Gaussian curvature (Steiner's formula), so the
-    density is even to within K h²/3: 0.3 % where both radii of curvature are 0.1 and h is 0.01.
+    2h(1 + K h²/3) of volume per area, K being the Gaussian curvature (Steiner's formula), so the density is even to
+    within K h²/3: 0.3 % where both radii of curvature are 0.1 and h is 0.01.
 
     Args:
-        field: any field of three dimensions; its finest level is sampled.
-        count: how many points.
+        field: of three dimensions; its finest level is sampled.
+        count: number of points.
         seed: of the random numbers.
         shell: half-width h, in the field's units.
-        extent: points are looked for in the cube [-extent, extent]³.
-        steepness: a bound of |∇f| near the surface; it lets empty space be skipped.
+        extent: the surface is sampled in the cube [-extent, extent]³.
+        steepness: a bound of |∇f| near the surface, by which empty space is skipped.
         block: candidates drawn at once.
 
     Raises:
         ValueError: there is no surface in the cube.
-
-    Example:
-        >>> from mplicits.neural_fields import Torus
-        >>> sample_surface(Torus(), 1000, seed=1).points.shape
-        (1000, 3)
     """
     random = np.random.default_rng(seed)
     corners, size = _occupied_cells(field, extent, shell, steepness)
@@ -72,7 +54,7 @@ def sample_surface(
         value, gradient = jet_at(field, candidates)
         candidates = candidates[np.abs(value) < shell * np.linalg.norm(gradient, axis=1)]
         points, directions, converged = feet_and_normals(field, candidates)
-        # a first-order distance can be far off where the gradient is small
+        # A first-order distance can be far off where the gradient is small.
         converged &= np.linalg.norm(points - candidates, axis=1) < 3 * shell
         found.append(points[converged])
         normals.append(directions[converged])
@@ -85,13 +67,10 @@ def sample_surface(
 def feet_and_normals(
     field: Field, points: Float64, *, tolerance: float = 1e-9, steps: int = 20
 ) -> tuple[Float64, Float64, NDArray[np.bool_]]:
-    """Move ``points`` ``(N, 3)`` on the zero set by Newton's method along the gradient, x ← x - f ∇f / |∇f|².
+    """Project ``points`` ``(N, 3)`` on the zero set by Newton's method along the gradient, x ← x - f ∇f / |∇f|².
 
-    `neural_fields.project_to_surface` does so for fields that are only nearly distances, with steps that it bounds
-    where they are flat; exact clouds come from full steps in float64, and keep the normals of the last one.
-
-    Returns:
-        The points, unit normals there ``(N, 3)``, and whether |f| got below ``tolerance`` ``(N,)``.
+    Returns the points, unit normals ``(N, 3)``, and whether |f| is below ``tolerance`` ``(N,)``. The steps are full and
+    in float64; `neural_fields.project_to_surface` bounds its steps.
     """
     points, normals = points.copy(), np.zeros_like(points)
     converged = np.zeros(len(points), bool)
@@ -109,18 +88,13 @@ def feet_and_normals(
 
 
 def sample_sphere(count: int, *, radius: float = 0.5, seed: int = 0) -> PointCloud:
-    """``count`` points exactly even on the sphere around the origin, with exact normals.
-
-    Example:
-        >>> bool(abs((sample_sphere(100).points ** 2).sum(axis=1) - 0.25).max() < 1e-12)
-        True
-    """
+    """``count`` points uniform on the sphere around the origin, with exact normals."""
     normals = _directions(np.random.default_rng(seed), count)
     return PointCloud(radius * normals, normals.astype(np.float32), None, "sphere")
 
 
 def sample_torus(count: int, *, major: float = 0.5, minor: float = 0.2, seed: int = 0) -> PointCloud:
-    """``count`` points exactly even on the torus around the z axis, with exact normals.
+    """``count`` points uniform on the torus around the z axis, with exact normals.
 
     The angle around the tube has density ∝ major + minor·cos(angle); it is drawn by rejection.
     """
@@ -156,15 +130,10 @@ def add_noise(cloud: PointCloud, amplitude: float, *, seed: int = 0) -> PointClo
 def add_isotropic_noise(cloud: PointCloud, amplitude: float, *, seed: int = 0) -> PointCloud:
     """Move points by N(0, σ²) in each coordinate, σ = ``amplitude``·(diagonal of the bounding box)/√3; normals stay.
 
-    Along any direction that is as strong as `add_noise` of the same ``amplitude`` is along the normals.
+    Along any direction, this is as strong as `add_noise` along the normals.
 
     Raises:
         ValueError: ``amplitude`` is negative.
-
-    Example:
-        >>> cloud = sample_sphere(10_000)  # a diagonal of √3
-        >>> bool(abs((add_isotropic_noise(cloud, 0.01).points - cloud.points).std() - 0.01) < 5e-4)
-        True
     """
     if not amplitude >= 0:
         raise ValueError(f"amplitude={amplitude}: expected a fraction of the diagonal, 0 or more")
@@ -206,7 +175,7 @@ def _directions(random: np.random.Generator, count: int) -> Float64:
 def _occupied_cells(
     field: Field, extent: float, shell: float, steepness: float, *, cells: int = 48
 ) -> tuple[Float64, float]:
-    """Lower corners ``(M, 3)`` of the cells of a regular grid that the shell may cross, and the cells' size."""
+    """Lower corners ``(M, 3)`` of the grid cells that the shell may cross, and the cells' size."""
     size = 2 * extent / cells
     axis = -extent + size * np.arange(cells, dtype=np.float64)
     corners: Float64 = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -219,63 +188,3 @@ def jet_at(field: Field, points: Float64) -> tuple[Float64, Float64]:
     with torch.no_grad():
         jet = field.jet(torch.from_numpy(points))
     return jet.value.double().numpy(), jet.gradient.double().numpy()
-
-
-def refine_closest(
-    field: Field, targets: Float64, starts: Float64, *, steps: int = 60, tolerance: float = 1e-10
-) -> Float64:
-    """Distance ``(M,)`` from each target to the surface point closest to it near its start.
-
-    Minimises |x - q|²/2 over the surface by projected gradient descent: q moves by ``rate`` times the tangential
-    part of x - q and back onto the surface. The rate is that of Barzilai and Borwein (IMA J. Numer. Anal., 1988),
-    ⟨s, s⟩/⟨s, y⟩ with s the last move and y the change of the gradient over it, so that no curvature need be
-    known. A move that does not shorten |x - q| is undone, and its rate cut to a quarter.
-
-    Args:
-        field: the surface is its zero set.
-        targets: ``(M, 3)`` points x.
-        starts: ``(M, 3)`` points near the surface, closer to the foot sought than to any other.
-        steps: at most.
-        tolerance: stop where a move gains less than about this, in the field's units.
-    """
-    foot, normal, _ = feet_and_normals(field, starts)
-    best = np.linalg.norm(targets - foot, axis=1)
-    tangential = _tangential(targets - foot, normal)
-    rate = np.ones(len(targets))
-    active = np.arange(len(targets))
-    for _ in range(steps):
-        gain = rate[active] * (tangential[active] ** 2).sum(axis=1) / np.maximum(best[active], 1e-9)
-        active = active[gain > tolerance]
-        if len(active) == 0:
-            break
-        moved, turned, landed = feet_and_normals(field, foot[active] + rate[active, None] * tangential[active])
-        length = np.linalg.norm(targets[active] - moved, axis=1)
-        better = landed & (length < best[active])
-        rate[active[~better]] *= 0.25
-        chosen, moved, turned = active[better], moved[better], turned[better]
-        along = _tangential(targets[chosen] - moved, turned)
-        move = moved - foot[chosen]
-        change = (move * (tangential[chosen] - along)).sum(axis=1)
-        curved = change > 0
-        rate[chosen] = np.where(curved, (move**2).sum(axis=1) / np.where(curved, change, 1.0), 1.0).clip(1e-3, 100.0)
-        foot[chosen], tangential[chosen], best[chosen] = moved, along, length[better]
-    return best
-
-
-def distinct_starts(
-    points: Float64, normals: NDArray[np.floating], *, radius: float, cosine: float = 0.9
-) -> NDArray[np.bool_]:
-    """Which of each target's candidate starts ``(M, c, 3)`` are worth a descent of their own ``(M, c)``.
-
-    One within ``radius`` of an earlier one that is kept, with its normal to within ``cosine``, leads to the same foot.
-    """
-    kept = np.ones(points.shape[:2], bool)
-    for later in range(1, points.shape[1]):
-        near = ((points[:, :later] - points[:, later, None]) ** 2).sum(axis=2) < radius**2
-        alike = (normals[:, :later] * normals[:, later, None]).sum(axis=2) > cosine
-        kept[:, later] = ~(near & alike & kept[:, :later]).any(axis=1)
-    return kept
-
-
-def _tangential(offset: Float64, normal: Float64) -> Float64:
-    return offset - (offset * normal).sum(axis=1, keepdims=True) * normal

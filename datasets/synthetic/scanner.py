@@ -1,7 +1,12 @@
-"""A simulated scan: virtual range scanners around a field, with the faults that real ones have."""
+"""Simulated scans: virtual range scanners around a field, with noise and other faults.
+
+The faults are applied in this order: smear of mixed pixels, range noise, quantisation, isotropic noise, uneven density,
+misalignment of the scan.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -9,26 +14,58 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...neural_fields import Field, Similarity
 from ..clouds.point_cloud import PointCloud, unit_rows
 from ..depth.cleaning import both_sides
-from .faults import ScanFaults, kept_unevenly, quantised, rigid_motion, smeared
 from .samples import jet_at
 from .statue import Statue
 
-__all__ = ["STATUE_NOISE", "STATUE_PLACEMENT", "SimulatedScan", "scan_with_truth", "simulate_scan", "statue_scan"]
-
 Float64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 STATUE_PLACEMENT = Similarity((1250.0, -840.0, 930.0), 480.0)
-"""Where the bundled scan stands: in millimetres, as if measured in the hall of a museum."""
+"""From the statue's unit sphere to the millimetres of the bundled scan."""
 
 STATUE_NOISE = 2e-4
 """Standard deviation of the bundled scan's ranges in units of the statue: about a tenth of a millimetre."""
 
-_RELAX = 0.75  # steps are this much shorter than the field says, because a field may be steeper than a distance
-_STEPS = 96  # of a ray at most
+_RELAX = 0.75  # step over field value, because a field may be steeper than a distance
+_STEPS = 96  # largest number of steps of a ray
+
+
+@dataclass(frozen=True)
+class ScanFaults:
+    """Strengths of the faults of a simulated scan; lengths in the units of the scanned field.
+
+    Attributes:
+        isotropic: standard deviation of each coordinate of each point.
+        quantise: ranges are rounded to multiples of this; 0 leaves them.
+        misalign: registration error: standard deviation of each coordinate of the shift of each scan, and of its
+            rotation vector in radians.
+        smear: share of the readings beside a jump in depth that lie between its two sides, from 0 to 1.
+        uneven: density of the points on one side over that on the other, 1 or more.
+
+    Raises:
+        ValueError: one of them is out of its bounds.
+    """
+
+    isotropic: float = 0.0
+    quantise: float = 0.0
+    misalign: float = 0.0
+    smear: float = 0.0
+    uneven: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("isotropic", "quantise", "misalign"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name}={value}: expected a length, 0 or more")
+        if not 0 <= self.smear <= 1:
+            raise ValueError(f"smear={self.smear}: expected a share from 0 to 1")
+        if not 1 <= self.uneven < math.inf:
+            raise ValueError(f"uneven={self.uneven}: expected a factor of 1 or more")
 
 
 def statue_scan(
@@ -40,12 +77,9 @@ def statue_scan(
 ) -> PointCloud:
     """Scan the :class:`Statue` from twelve places: the bundled sample, some 100,000 points in millimetres.
 
-    The ranges have a tenth of a millimetre of noise, as those of hand-held structured-light scanners, and points are
-    1.6 mm apart: there is detail for every level to find. Nothing is seen of the face that the statue stands on, and
-    little of the owl from below.
-
-    ``STATUE_PLACEMENT.to_unit(points)`` leads back to the coordinates of ``Statue().exact_distance``. Of
-    ``noise``, ``faults`` (none unless given) and ``progress`` see `scan_with_truth`.
+    Points are 1.6 mm apart, with a tenth of a millimetre of range noise, as of hand-held structured-light scanners. The
+    bottom of the statue is not scanned. ``STATUE_PLACEMENT.to_unit(points)`` has the coordinates of the field
+    ``Statue()``. The arguments are those of `scan_with_truth`.
     """
     statue = Statue()
     return simulate_scan(
@@ -67,20 +101,19 @@ def simulate_scan(field: Field, **options: Any) -> PointCloud:
 
 @dataclass(frozen=True)
 class SimulatedScan:
-    """A scan, and the truth behind each of its points; all in the coordinates of the cloud.
+    """A scan and its truth, in the coordinates of the cloud.
 
-    The point ``x`` of scanner ``s`` was measured at ``motions[s]⁻¹ x``, on the ray from ``positions[s]`` through
-    ``exact`` but for isotropic noise.
+    The point ``x`` of scanner ``s`` was measured at ``motions[s]⁻¹ x``. But for isotropic noise, this lies on the ray
+    from ``positions[s]`` through ``exact``.
 
     Attributes:
-        cloud: what the scanners say.
-        exact: ``(N, 3)`` where each point's ray meets the surface: to rounding, and to 4e-5 of the unit sphere where it
-            grazes it.
+        cloud: the points of all scanners.
+        exact: ``(N, 3)`` hits of the rays: to rounding, and to 4e-5 of the unit sphere at grazing incidence.
         exact_normals: ``(N, 3)`` unit normals of the surface there.
-        scanner: ``(N,)`` which scanner it was.
+        scanner: ``(N,)`` number of the scanner.
         smeared: ``(N,)`` whether the reading is a mixture with that of a neighbour.
-        positions: ``(S, 3)`` where the scanners stood.
-        motions: ``(S, 4, 4)`` registration errors: rigid motions from where points were measured to where they are.
+        positions: ``(S, 3)`` of the scanners.
+        motions: ``(S, 4, 4)`` rigid registration errors, from measured points to those of the cloud.
     """
 
     cloud: PointCloud
@@ -106,22 +139,20 @@ def scan_with_truth(
 ) -> SimulatedScan:
     """Scan the zero set of ``field``, which lies in the unit sphere, with a ring of range scanners.
 
-    Every scanner measures ranges on a perspective grid of rays. Distances and resolutions differ from one to the
-    next (uneven density), each sees only what nothing hides, ranges carry Gaussian noise along the ray, and rays
-    that graze the surface are mostly lost. Normals are those of the noisy range grid, facing the scanner;
-    where a pixel has no neighbour on the same surface its normal is zero, as in real range data.
+    Every scanner measures ranges on a perspective grid of rays, with Gaussian noise along the rays. Distances and
+    resolutions differ between scanners. Rays that graze the surface are mostly lost. Normals are those of the noisy
+    range grid, facing the scanner; they are zero where a pixel has no neighbour on the same surface.
 
     Args:
-        field: a field in the unit sphere, 1-Lipschitz or nearly so, positive outside.
-        scanners: how many, evenly around the z axis, at changing heights.
+        field: in the unit sphere, 1-Lipschitz or nearly so, positive outside.
+        scanners: number of scanners, evenly around the z axis, at changing heights.
         resolution: rays along each side of a grid, on average.
         noise: standard deviation of the ranges, in the field's units.
         colors: the colour at points ``(N, 3)``, in the field's units.
-        placement: from the field's coordinates to those of the scan; none leaves them as they are.
-        faults: what else goes wrong; nothing by default. Their random numbers are their own: the same seed gives the
-            same rays, losses and noise with any of them.
+        placement: from the field's coordinates to those of the scan; by default the identity.
+        faults: none by default. The same seed gives the same rays, losses and noise with any faults.
         seed: of the random numbers.
-        progress: told how many steps are done, and of how many: those of the rays, and one for each scanner.
+        progress: called with the number of steps done and of all steps: those of the rays, and one for each scanner.
 
     Raises:
         ValueError: ``scanners`` or ``resolution`` is too small, ``noise`` is negative, or no ray hits anything.
@@ -139,7 +170,7 @@ def scan_with_truth(
     faults, place = faults or ScanFaults(), placement or Similarity.identity()
     random = np.random.default_rng(seed)
     views = [_view(index, scanners, resolution, random) for index in range(scanners)]
-    # all rays at once: late steps, with few rays left, cost as much as early ones
+    # All rays at once: late steps, with few rays left, cost as much as early ones.
     origins = np.concatenate([np.broadcast_to(view.position, view.rays.shape).reshape(-1, 3) for view in views])
     total, tell = _STEPS + scanners, progress or (lambda _done, _total: None)
     tell(0, total)
@@ -183,7 +214,7 @@ def _in_place(motion: Float64, place: Similarity) -> Float64:
 
 
 class _Readings(NamedTuple):
-    """What one scanner keeps, in the field's units; see `SimulatedScan`."""
+    """The points of one scanner, in the field's units; see `SimulatedScan`."""
 
     points: Float64
     normals: Float64
@@ -217,7 +248,7 @@ def _measure(
     random: np.random.Generator,
     extra: np.random.Generator,
 ) -> _Readings:
-    """One scanner's points, with all that goes wrong; ``extra`` draws for the faults, ``random`` for the rest."""
+    """The points of one scanner; ``extra`` draws the random numbers of the faults, ``random`` the others."""
     position, rays = view
     ranges = ranges.reshape(rays.shape[:2])  # NaN: nothing hit
     exact = position + ranges[..., None] * rays
@@ -225,7 +256,7 @@ def _measure(
     upright, facing = np.zeros_like(rays), np.zeros_like(ranges)
     upright[hit] = _unit_gradient(field, exact[hit])
     facing[hit] = -(upright[hit] * rays[hit]).sum(axis=1)
-    # a surface seen at 84° or flatter returns nothing, from 66° on everything comes back
+    # All rays return at incidences up to 66°, none from 84° on.
     hit &= random.uniform(0, 1, hit.shape) < (facing - 0.1) / 0.3
     mixed, smears = smeared(ranges, rays, faults.smear, extra)
     ranges = np.where(hit, mixed + random.normal(0, noise, ranges.shape), np.nan)
@@ -262,7 +293,7 @@ class _EmptySpace:
         self._clearance = _RELAX * _value(field, grid.reshape(-1, 3)) - np.sqrt(3) / cells
 
     def clearance(self, points: Float64) -> Float64:
-        """A distance ``(N,)`` that the surface keeps from ``points`` ``(N, 3)``; 0 or less promises nothing."""
+        """A lower bound ``(N,)`` of the distance of ``points`` ``(N, 3)`` from the surface, if it is above 0."""
         index = ((points + 1) * (self._cells / 2)).astype(np.int64).clip(0, self._cells - 1)
         return self._clearance[(index[:, 0] * self._cells + index[:, 1]) * self._cells + index[:, 2]]
 
@@ -272,11 +303,11 @@ def _trace(
 ) -> Float64:
     """Sphere tracing inside the unit sphere: range ``(R,)`` along each unit ray ``(R, 3)``, NaN for a miss.
 
-    The field is evaluated only where :class:`_EmptySpace` cannot promise a step; two Newton steps along the ray then
-    take the hit from ``tolerance`` down to rounding.
+    The field is evaluated only where :class:`_EmptySpace` has no bound; two Newton steps along the ray then take the
+    hit from ``tolerance`` down to rounding.
     """
-    # Not `sphere_trace`: it does not know where space is empty, so it takes twice as long for the statue; and it finds
-    # more rays that graze the surface, so the bundled scan, on which published figures rest, would be another cloud.
+    # `sphere_trace` takes twice as long for the statue, without `_EmptySpace`, and finds more rays that graze the
+    # surface: the bundled scan, on which published figures rest, would be another cloud.
     empty = _EmptySpace(field)
     middle = -(rays * origins).sum(axis=1)
     half_chord = np.sqrt((middle**2 - (origins**2).sum(axis=1) + 1).clip(min=0))
@@ -331,3 +362,53 @@ def _value(field: Field, points: Float64) -> Float64:
 def _unit_gradient(field: Field, points: Float64) -> Float64:
     gradient = jet_at(field, points)[1]
     return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+
+
+def quantised(ranges: Float64, step: float) -> Float64:
+    """Ranges rounded to multiples of ``step``, ``⌊r / step + ½⌋ · step``."""
+    return np.floor(ranges / step + 0.5) * step if step else ranges
+
+
+def depth_jumps(ranges: Float64, rays: Float64, axis: int) -> Mask:
+    """Jumps of depth between neighbours along ``axis`` of a grid of ranges ``(H, W)``; one shorter along it.
+
+    Readings r and r' on rays an angle α apart are on different surfaces if ``|r − r'| > tan(84°) α min(r, r')``: one
+    surface between them would be seen at 84° or flatter. Without one of the readings (NaN) there is no jump.
+    """
+    r, direction = np.moveaxis(ranges, axis, 0), np.moveaxis(rays, axis, 0)
+    sine = np.linalg.norm(direction[1:] - direction[:-1], axis=-1) / 2  # of half the angle
+    nearer = np.minimum(r[1:], r[:-1])
+    jump = np.abs(r[1:] - r[:-1]) > math.tan(math.radians(84.0)) * 2 * np.arcsin(sine) * nearer
+    return np.moveaxis(jump, 0, axis)
+
+
+def smeared(ranges: Float64, rays: Float64, share: float, random: np.random.Generator) -> tuple[Float64, Mask]:
+    """Ranges with mixed pixels, and the mask of these, each ``(H, W)``.
+
+    With the probability ``share``, a reading r beside a jump (see `depth_jumps`) becomes ``r + t (r' − r)``: r' is the
+    most different reading across a jump, t uniform in (0, 1). Two random numbers per pixel are drawn for any share.
+    """
+    step, size = np.zeros_like(ranges), np.zeros_like(ranges)
+    for axis in (0, 1):
+        change = np.where(depth_jumps(ranges, rays, axis), np.diff(ranges, axis=axis), 0.0)
+        after, before = both_sides(change, axis)
+        for towards in (after, -before):
+            larger = np.abs(towards) > size
+            step, size = np.where(larger, towards, step), np.where(larger, np.abs(towards), size)
+    chosen, way = random.uniform(size=(2, *ranges.shape))
+    mixed = (size > 0) & (chosen < share)
+    return np.where(mixed, ranges + way * step, ranges), mixed
+
+
+def kept_unevenly(points: Float64, direction: Float64, factor: float, random: np.random.Generator) -> Mask:
+    """A mask of the points ``(..., 3)`` of the unit sphere, each kept with probability ``factor^−(1 + ⟨x, d⟩)/2``."""
+    height = (1 + points @ direction) / 2
+    return random.uniform(size=height.shape) < factor ** -height.clip(0, 1)
+
+
+def rigid_motion(size: float, random: np.random.Generator) -> Float64:
+    """A random motion ``(4, 4)``, x → R x + t; t and the rotation vector of R (radians) are ``size`` · N(0, 1)."""
+    motion = np.eye(4)
+    shift, turn = random.normal(0, 1, (2, 3)) * size
+    motion[:3, :3], motion[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), shift
+    return motion

@@ -1,8 +1,4 @@
-"""Exact synthetic scenes: shapes and colours in closed form, and posed images of them by our own sphere tracer.
-
-Whatever reconstructs a scene can be held against the truth: the field is the distance (or, of the statue, an implicit
-function that vanishes exactly on the surface), the colour is a function of the position.
-"""
+"""Synthetic scenes with shapes and colours in closed form, and posed images of them by sphere tracing."""
 
 from __future__ import annotations
 
@@ -18,32 +14,24 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Box, Capsule, Field, Similarity, Sphere, Torus, Union, sphere_trace
+from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ...neural_fields.meshing.extract import Mesh, extract_mesh
-from ..cameras import Camera
+from ..cameras import UP_AXES, Camera, look_at
+from ..clouds.cleaning.orientation import fibonacci_directions
 from ..clouds.point_cloud import PointCloud
-from ..color_space import srgb_to_linear
-from ..views.formats.depth_maps import DepthMap
+from ..views.formats.shots import DepthMap
 from ..views.images import PosedImage, PosedImages
 from .samples import sample_surface
 from .statue import Statue
-from .studio import cameras_around, developed, lit
-
-__all__ = [
-    "SCENES",
-    "Scene",
-    "render_scene",
-    "render_view",
-    "sample_scene",
-    "scene_cameras",
-    "scene_depths",
-    "scene_mesh",
-]
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Rgb = tuple[float, float, float]
 
 RAYS_AT_ONCE = 1 << 17
+LAMP = (0.4, 0.7, 0.6)  # towards the lamp, for shaded scenes
+AMBIENT = 0.35  # share of ambient light
+GLOSS, SHARPNESS = 0.6, 40  # strength and exponent of the highlight (Blinn 1977)
 
 
 @dataclass(frozen=True)
@@ -51,8 +39,8 @@ class Scene:
     """A shape and its paint, both in closed form.
 
     Attributes:
-        name: what files and messages call it.
-        field: whose zero set is the surface; inside the unit sphere.
+        name: used in files and messages.
+        field: its zero set is the surface, inside the unit sphere.
         color: display RGB ``(N, 3)`` in [0, 1] of points ``(N, 3)``, the same from all directions.
         radius: of a ball around the origin that holds the surface.
         up: "y" or "z", the axis that points up.
@@ -68,17 +56,7 @@ class Scene:
 
 
 def scene_cameras(scene: Scene, *, views: int = 24, size: int = 64, seed: int = 0) -> list[Camera]:
-    """Cameras spread evenly over a sphere around a scene, upright, with all of the shape in view.
-
-    Args:
-        scene: what they look at.
-        views: how many.
-        size: width and height of the images, in pixels.
-        seed: of the turn.
-
-    Raises:
-        ValueError: ``views`` or ``size`` is not positive.
-    """
+    """`cameras_around` a scene."""
     return cameras_around(scene.radius, up=scene.up, views=views, size=size, seed=seed)
 
 
@@ -94,16 +72,16 @@ def render_scene(
     depths: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> PosedImages:
-    """Posed images of a scene, with exact poses, colours and masks, and a few points of its surface with who sees them.
+    """Posed images of a scene, with exact poses, colours and masks, and 1000 points of its surface with observations.
 
     Args:
-        scene: what to draw.
-        views: how many images.
+        scene: from `SCENES`, or another.
+        views: number of images.
         size: width and height of the images, in pixels.
         seed: of the cameras and the points.
         samples: rays per pixel and direction.
-        shaded: whether a fixed lamp lights the shape; without, the images show the paint itself.
-        glossy: whether the lamp is reflected, in a highlight that moves with the eye.
+        shaded: whether a fixed lamp lights the shape; without it, the images show the paint itself.
+        glossy: whether the lamp has a highlight that moves with the eye.
         depths: whether each image has the depths of its pixels' centres.
         progress: called with ``(done, total)`` after every image, or several small ones.
 
@@ -120,19 +98,13 @@ def render_scene(
             images.append(PosedImage(f"{len(images):03d}.png", camera, *seen, depth))
         if progress is not None:
             progress(len(images), views)
-    # About as many as structure from motion would give.
     points = sample_surface(scene.field, 1000, seed=seed).points
     seen = _observations(scene, points, [view.camera for view in images])
     return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name), seen)
 
 
 def scene_depths(scene: Scene, camera: Camera) -> DepthMap:
-    """The depths ``(H, W)`` along the axis of view of what a camera's pixels see in their middle; NaN of what misses.
-
-    Args:
-        scene: what is seen.
-        camera: in the scene's coordinates.
-    """
+    """Depths ``(H, W)`` along the axis of view at the centres of a camera's pixels; NaN for a miss."""
     return _depths(scene, [camera])[0]
 
 
@@ -147,15 +119,15 @@ def _depths(scene: Scene, cameras: Sequence[Camera]) -> list[DepthMap]:
 
 
 class _Seen(NamedTuple):
-    """What the rays of a camera meet: ``(H, W)`` whether, ``(H, W, 3)`` where, and their directions."""
+    """Hits of the rays of a camera."""
 
-    mask: Tensor
-    position: Tensor
-    direction: Tensor
+    mask: Tensor  # (H, W)
+    position: Tensor  # (H, W, 3)
+    direction: Tensor  # (H, W, 3)
 
 
 def _traced(scene: Scene, cameras: Sequence[Camera]) -> list[_Seen]:
-    """The rays of several cameras in one march: of a few rays it takes as long as of thousands."""
+    """Trace the rays of several cameras together: a few rays take as long as thousands."""
     rays = [camera.rays(dtype=torch.float64) for camera in cameras]
     eyes = torch.cat([eye.expand_as(directions).reshape(-1, 3) for eye, directions in rays])
     along = torch.cat([directions.reshape(-1, 3) for _, directions in rays])
@@ -166,7 +138,7 @@ def _traced(scene: Scene, cameras: Sequence[Camera]) -> list[_Seen]:
 
 
 def _observations(scene: Scene, points: Float64, cameras: Sequence[Camera]) -> NDArray[np.int64]:
-    """``(K, 2)`` which camera sees which of the points ``(P, 3)``: in its picture, with nothing before them."""
+    """``(K, 2)`` pairs of a camera and a point ``(P, 3)`` that it sees: in its picture, with nothing before it."""
     eyes = torch.stack([camera.eye for camera in cameras])
     away = torch.from_numpy(points) - eyes[:, None]  # (V, P, 3)
     length = away.norm(dim=-1)
@@ -180,24 +152,7 @@ def _observations(scene: Scene, points: Float64, cameras: Sequence[Camera]) -> N
 def render_view(
     scene: Scene, camera: Camera, *, samples: int = 3, shaded: bool = False, glossy: bool = False
 ) -> tuple[Float32, Float32]:
-    """Draw a scene from one camera.
-
-    The colour of a pixel is the mean light of those of its rays that hit (straight alpha, black where none does), the
-    mask is their share.
-
-    Args:
-        scene: what to draw.
-        camera: in the scene's coordinates.
-        samples: rays per pixel and direction.
-        shaded: whether a fixed lamp lights the shape.
-        glossy: whether the lamp is reflected.
-
-    Returns:
-        Display RGB ``(H, W, 3)`` and the mask ``(H, W)``, both in [0, 1].
-
-    Raises:
-        ValueError: ``samples`` is not positive.
-    """
+    """One picture of a scene (see `developed`): display RGB ``(H, W, 3)`` and mask ``(H, W)``, both in [0, 1]."""
     return _pictures(scene, [camera], samples, shaded, glossy)[0]
 
 
@@ -232,7 +187,7 @@ def _strips(
 
 
 def _light(scene: Scene, points: Float64, directions: Float64, shaded: bool, glossy: bool) -> Float64:
-    """Linear light ``(N, 3)`` that points ``(N, 3)`` of the surface send to eyes that look along ``(N, 3)``."""
+    """Linear light ``(N, 3)`` of points ``(N, 3)`` of the surface, seen along ``directions`` ``(N, 3)``."""
     light = srgb_to_linear(scene.color(points))
     if not (shaded or glossy):
         return light
@@ -243,12 +198,7 @@ def _light(scene: Scene, points: Float64, directions: Float64, shaded: bool, glo
 
 
 def scene_mesh(scene: Scene, *, resolution: int = 256) -> Mesh:
-    """The true surface with its colours, as a mesh to hold reconstructions against.
-
-    Args:
-        scene: whose surface.
-        resolution: cells along the side of the cube around it.
-    """
+    """The true surface with its colours, as a mesh; ``resolution`` is in cells along the side of the cube around it."""
     side = 1.02 * scene.radius
     bounds = ((-side, -side, -side), (side, side, side))
     mesh = extract_mesh(scene.field, resolution=resolution, bounds=bounds, lipschitz=max(1.25, scene.lipschitz))
@@ -256,13 +206,7 @@ def scene_mesh(scene: Scene, *, resolution: int = 256) -> Mesh:
 
 
 def sample_scene(scene: Scene, count: int, *, seed: int = 0) -> PointCloud:
-    """``count`` points of the true surface, evenly by area, with exact normals and colours.
-
-    Args:
-        scene: whose surface.
-        count: how many points.
-        seed: of the random numbers.
-    """
+    """``count`` points of the true surface, evenly by area, with exact normals and colours."""
     cloud = sample_surface(scene.field, count, seed=seed)
     return replace(cloud, colors=scene.color(cloud.points).astype(np.float32), source=scene.name)
 
@@ -298,7 +242,7 @@ def _mix(first: Rgb, second: Rgb, share: Float64) -> Float64:
 
 
 def _spots(points: Float64) -> Float64:
-    """Soft patches of many hues: sines of the coordinates, another phase for each channel."""
+    """Soft patches of many hues: sines of the coordinates with a phase for each channel."""
     x, y, z = points.T
     waves = [9 * x + 4 * np.sin(5 * y), 9 * y + 4 * np.sin(5 * z) + 1, 9 * z + 4 * np.sin(5 * x) + 2]
     return 0.5 + 0.4 * np.sin(np.stack(waves, axis=1))
@@ -321,7 +265,57 @@ def _checks(points: Float64) -> Float64:
     return dark + (0.5 + 0.5 * board)[:, None] * (light - dark)
 
 
+def cameras_around(
+    radius: float, *, up: str = "y", views: int = 24, size: int = 64, seed: int = 0, middle: Sequence[float] = (0, 0, 0)
+) -> list[Camera]:
+    """Upright cameras on a sphere around a ball of ``radius``, with all of it in square images of ``size`` pixels.
+
+    They stand on a Fibonacci lattice that is turned at random: another seed gives other views.
+    """
+    for name, number in (("views", views), ("size", size)):
+        if number < 1:
+            raise ValueError(f"{name}={number}: expected at least one")
+    # The orthogonal factor of a Gaussian matrix is a uniform rotation or reflection.
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    distance = 4.0  # of the eyes from the middle, in radii
+    eyes = np.array(middle) + distance * radius * fibonacci_directions(views) @ turn.T
+    # A ball of radius r at distance d fills the angle 2 asin(r / d); one of 1.1 radii fills the images.
+    fov = 2 * float(np.degrees(np.arcsin(1.1 / distance)))
+    return [look_at(torch.from_numpy(eye), middle, up=UP_AXES[up], fov=fov, width=size, height=size) for eye in eyes]
+
+
+def developed(light: NDArray[np.floating], mask: NDArray[np.bool_], samples: int) -> tuple[Float32, Float32]:
+    """The mean light of the rays of each pixel that hit, as display RGB ``(H, W, 3)``, and their share ``(H, W)``.
+
+    ``light`` ``(H · samples, W · samples, 3)`` is linear, and 0 where ``mask`` says that the ray misses.
+    """
+    height, width = (side // samples for side in mask.shape)
+    tiles = (height, samples, width, samples)
+    hits = mask.reshape(tiles).sum(axis=(1, 3))
+    mean = light.reshape(*tiles, 3).sum(axis=(1, 3)) / np.maximum(hits, 1)[..., None]
+    color = np.asarray(linear_to_srgb(mean)).clip(0, 1).astype(np.float32)
+    return color, (hits / samples**2).astype(np.float32)
+
+
+def lit(light: NDArray[np.floating], normals: Float64, directions: Float64, *, shaded: bool, glossy: bool) -> Float64:
+    """Shade a surface under a fixed lamp → linear light ``(N, 3)``.
+
+    ``light`` ``(N, 3)`` is the linear colour of the surface; ``directions`` ``(N, 3)`` are those of the views, from the
+    eye. ``shaded`` is Lambert's cosine with ambient light, ``glossy`` adds a highlight (Blinn 1977).
+    """
+    towards = np.array(LAMP) / np.linalg.norm(LAMP)
+    cosine, sent = normals @ towards, np.asarray(light, np.float64)
+    if shaded:
+        sent = sent * (AMBIENT + (1 - AMBIENT) * np.maximum(cosine, 0))[:, None]
+    if glossy:
+        halfway = towards - directions
+        halfway /= np.maximum(np.linalg.norm(halfway, axis=1, keepdims=True), 1e-12)
+        aligned = np.maximum((normals * halfway).sum(axis=1), 0)
+        sent = sent + (GLOSS * np.where(cosine > 0, aligned**SHARPNESS, 0.0))[:, None]
+    return sent
+
+
 SCENES: Mapping[str, Callable[[], Scene]] = MappingProxyType(
     {"painted-sphere": _painted_sphere, "striped-torus": _striped_torus, "figure": _figure, "statue": _statue}
 )
-"""What builds each scene."""
+"""Makers of scenes by name."""

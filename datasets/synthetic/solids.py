@@ -1,8 +1,7 @@
 """Building blocks of procedural solids: each maps points ``(N, 3)`` to a distance and its gradient.
 
 Formulas for the distances and for the polynomial smooth minimum follow Inigo Quilez, "Distance functions" and
-"Smooth minimum" (iquilezles.org); the gradients are our own closed forms. A combination of solids is
-1-Lipschitz wherever its parts are, so tracing it is safe.
+"Smooth minimum" (iquilezles.org). A combination of solids is 1-Lipschitz wherever its parts are.
 """
 
 from __future__ import annotations
@@ -12,21 +11,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-__all__ = [
-    "Solid",
-    "Vector",
-    "carve",
-    "displace",
-    "ellipsoid",
-    "fold",
-    "round_cone",
-    "rounded_box",
-    "rounded_drum",
-    "smooth_union",
-    "tilt",
-    "torus",
-]
 
 Vector = tuple[float, float, float]
 
@@ -144,8 +128,7 @@ def fold(p: Tensor) -> tuple[Tensor, Tensor]:
 def tilt(p: Tensor, center: Vector, angles: Vector) -> tuple[Tensor, Tensor]:
     """Points ``p`` in a frame turned by ``angles`` (radians; about x, then y, then z) around ``center``.
 
-    Returns:
-        The points ``(N, 3)``, and the matrix that takes gradients ``(N, 3)`` back: ``gradient @ matrix``.
+    The second result is the matrix that takes gradients ``(N, 3)`` back: ``gradient @ matrix``.
     """
     cx, cy, cz = (math.cos(angle) for angle in angles)
     sx, sy, sz = (math.sin(angle) for angle in angles)

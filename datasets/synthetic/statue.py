@@ -1,22 +1,16 @@
-"""The bundled sample: an owl with a staff on a fluted drum, as an implicit function with a known distance."""
+"""The bundled sample: an owl with a staff on a fluted drum, as an implicit function."""
 
 from __future__ import annotations
-
-from functools import cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...neural_fields import Jet
 from ...neural_fields.fields.field import OneLevelField
 from . import solids
-from .samples import distinct_starts, refine_closest, sample_surface
 from .solids import Solid, Vector
-
-__all__ = ["Statue"]
 
 Float64 = NDArray[np.float64]
 
@@ -27,11 +21,9 @@ _EYE: Vector = (0.105, -0.225, 0.435)
 class Statue(OneLevelField):
     """An owl on a column, z up, facing -y, inside the unit sphere: one watertight connected solid.
 
-    The implicit function is a smooth union of some thirty solids (see :mod:`solids`); it vanishes exactly on
-    the surface and is negative inside, but it is no distance: relief makes it steeper (|∇f| up to 1.4 at the surface),
-    blends in narrow grooves flatter. :meth:`exact_distance` gives the distance itself.
-
-    The thinnest part is the staff, of radius 0.022.
+    The implicit function is a smooth union of some thirty solids (see :mod:`solids`), negative inside. It is no
+    distance: |∇f| is up to 1.4 on relief, and below 1 in narrow grooves. The thinnest part is the staff, of radius
+    0.022.
     """
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
@@ -48,32 +40,9 @@ class Statue(OneLevelField):
 
     def _evaluate(self, x: Tensor) -> Solid:
         rows = x.reshape(-1, 3)
-        # Enough rows for threads to share, few enough for the temporaries to stay in cache.
+        # The temporaries of so many rows stay in cache.
         blocks = [_statue(block) for block in rows.split(16384)] if len(rows) else [Solid(rows[:, 0], rows)]
         return Solid(torch.cat([b.value for b in blocks]), torch.cat([b.gradient for b in blocks]))
-
-    def exact_distance(self, points: NDArray[np.floating], *, candidates: int = 24) -> Float64:
-        """Signed distance ``(N,)`` of ``points`` ``(N, 3)``, to 1e-6.
-
-        From the nearest of 100,000 surface samples, taken on first use, :func:`.closest.refine_closest`
-        descends to the closest point. The sign is that of the implicit function, which is exact.
-
-        Args:
-            points: in the unit sphere's coordinates.
-            candidates: how many nearest samples are considered; the shortest result counts.
-        """
-        points = np.asarray(points, np.float64)
-        if len(points) == 0:
-            return np.empty(0)
-        samples, normals, tree = _surface()
-        near = np.asarray(tree.query(points, k=candidates, workers=-1)[1])
-        row, column = np.nonzero(distinct_starts(samples[near], normals[near], radius=0.02))
-        found = refine_closest(self, points[row], samples[near[row, column]])
-        distance = np.full(len(points), np.inf)
-        np.minimum.at(distance, row, found)
-        with torch.no_grad():
-            inside = self.value(torch.from_numpy(points)).numpy() < 0
-        return np.where(inside, -distance, distance)
 
     def colors(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """Procedural texture ``(N, 3)`` in [0, 1] at ``points`` ``(N, 3)``: plumage, gilt, amber and marble."""
@@ -95,14 +64,6 @@ class Statue(OneLevelField):
         weights = torch.softmax(-distances / 0.004, dim=0)  # soft edges, about a hundredth wide
         mixed = (weights[..., None] * torch.stack(list(paints.values()))).sum(dim=0)
         return mixed.clamp(0, 1).float().numpy()
-
-
-@cache
-def _surface() -> tuple[Float64, NDArray[np.floating], KDTree]:
-    """Samples of the surface, their normals, and the way to the nearest of them."""
-    cloud = sample_surface(Statue(), 100_000, seed=0)
-    assert cloud.normals is not None
-    return cloud.points, cloud.normals, KDTree(cloud.points)
 
 
 def _statue(p: Tensor) -> Solid:
@@ -154,7 +115,7 @@ def _scales(p: Tensor, *, height: float = 0.010, around: float = 10.0, up: float
 
 
 def _around_axis(p: Tensor, relief: Tensor, by_angle: Tensor, by_height: Tensor, *, core: float = 0.03) -> Solid:
-    """A relief in cylinder coordinates, with its derivatives; faded out by ρ²/(ρ² + core²) where the angle is lost."""
+    """A relief in cylinder coordinates with its derivatives, faded out by ρ²/(ρ² + core²) near the axis."""
     x, y, _ = p.unbind(dim=1)
     squared = x * x + y * y
     around = by_angle / (squared + core**2)  # dθ = (-y dx + x dy) / ρ², and the fade cancels ρ²

@@ -1,4 +1,4 @@
-"""What goes wrong with posed photographs, one thing at a time: to see what a check says and a training survives."""
+"""Faults of posed photographs, one at a time, to test checks and trainings."""
 
 from __future__ import annotations
 
@@ -9,31 +9,20 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ..color_space import linear_to_srgb, srgb_to_linear
-from ..views.formats.depth_maps import DepthMap
+from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
+from ..views.formats.shots import DepthMap
 from ..views.images import PosedImage, PosedImages
-
-__all__ = ["VIEW_FAULTS", "with_fault"]
 
 
 def with_fault(images: PosedImages, fault: str, seed: int = 0) -> PosedImages:
     """The data set with one of the `VIEW_FAULTS`.
 
-    ``poses``: each camera is turned about its eye, by 0.5° (standard deviation) about each axis, and moved by 0.5 % of
+    ``poses``: each camera is turned about its eye by 0.5° (standard deviation) about each axis, and moved by 0.5 % of
     the region's radius along each; ``pose``: one camera looks 30° past the object; ``image``: one photograph is that of
-    another camera; ``mirrored``: all pictures are, left to right; ``masks``: object and background have changed places;
+    another camera; ``mirrored``: all pictures, left to right; ``masks``: object and background are exchanged;
     ``holes``: every twelfth mask has a hole in the middle of the object, a fifth of the picture wide; ``exposure``:
-    every other photograph has half of the light. What concerns one picture concerns the third, which is not held out,
-    and holes begin with it. Depth maps go with their pictures and their cameras.
-
-    Args:
-        images: of one size, three at least.
-        fault: which.
-        seed: of the poses.
-
-    Raises:
-        KeyError: there is no such fault.
-        ValueError: there are fewer than three views.
+    every other photograph has half of the light. The one picture, and the first with a hole, is the third, which is not
+    held out.
     """
     change = VIEW_FAULTS[fault]
     if len(images.views) < 3:
@@ -53,7 +42,7 @@ def _pose(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
 
 
 def _turned(view: PosedImage, degrees: np.ndarray, shift: np.ndarray) -> PosedImage:
-    """Its camera turned about its eye, in its own axes, and moved in the world's."""
+    """The view with its camera turned about its eye, in its own axes, and moved in the world's."""
     pose = view.camera.world_from_camera.clone()
     turn = torch.from_numpy(Rotation.from_rotvec(degrees, degrees=True).as_matrix()).to(pose)
     pose[:3, :3] = pose[:3, :3] @ turn
@@ -63,7 +52,7 @@ def _turned(view: PosedImage, degrees: np.ndarray, shift: np.ndarray) -> PosedIm
 
 
 def _placed(depth: DepthMap, pose: torch.Tensor) -> DepthMap:
-    """As if it had been taken there."""
+    """The depth map with another pose."""
     return replace(depth, camera=replace(depth.camera, world_from_camera=pose))
 
 

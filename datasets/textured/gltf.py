@@ -1,10 +1,7 @@
-"""GLTF 2.0 and its binary form GLB: triangles, base colours and their textures, placed by the scene's nodes.
+"""GLTF 2.0 and GLB (Khronos, "glTF 2.0 Specification"): triangles, base colours and textures, placed by the nodes.
 
-Files of our own are y-up and in metres by their node, which also says where the mesh was: they are read back in the
-coordinates of the input that they were made from. Written again by another program, they are where that says.
-
-Format: Khronos, "glTF 2.0 Specification". Read here and not with trimesh, which rounds base colours to 8 bits of linear
-light, and loses how textures go on beyond their sides and how KHR_texture_transform moves them.
+Files written by this package are read in the input coordinates that their node holds. trimesh rounds base colours to 8
+bits of linear light, and loses the wrapping of textures and KHR_texture_transform.
 """
 
 from __future__ import annotations
@@ -23,11 +20,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
+from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ...neural_fields.meshing.glb import GENERATOR
-from ..color_space import linear_to_srgb, srgb_to_linear
 from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
-
-__all__ = ["read_gltf"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -36,12 +31,12 @@ _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126:
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-# Extensions that change where the numbers are; others that a file requires change how it looks only.
+# Extensions that change the place of the numbers; others change the look only.
 _FOREIGN = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu")
 
 
 class _Piece(NamedTuple):
-    """One primitive of one node, in scene coordinates; colours are linear, v runs down."""
+    """One primitive of one node, in scene coordinates; colours are linear, v points down."""
 
     vertices: Float64
     faces: Int64
@@ -51,14 +46,9 @@ class _Piece(NamedTuple):
 
 
 def read_gltf(path: Path, *, textures: bool = True) -> TexturedMesh:
-    """Read all triangles of the scene of a GLB or glTF file, vertices in the order of the file.
+    """All triangles of the scene of a GLB or glTF file, vertices in the order of the file.
 
-    Args:
-        path: the file; buffers and images that it names lie beside it.
-        textures: whether to read images too, and base colours; without, only vertex colours are colours.
-
-    Raises:
-        InputError: it is damaged or compressed, holds no triangle, or an image is missing.
+    Without ``textures``, images and base colours are not read.
     """
     try:
         document = _Document.load(path)
@@ -111,7 +101,7 @@ class _Document:
         return file.read_bytes()
 
     def view(self, number: int) -> tuple[bytes, int, int]:
-        """A bufferView → its buffer, where it starts and its stride (0: tight)."""
+        """A bufferView → its buffer, its start and its stride (0: tight)."""
         view = self.header["bufferViews"][number]
         data, start, stride = self.buffer(view["buffer"]), _whole(view, "byteOffset"), _whole(view, "byteStride")
         if start + _whole(view, "byteLength") > len(data):
@@ -152,7 +142,7 @@ class _Document:
 
 
 def _whole(record: dict[str, Any], name: str) -> int:
-    """A number of bytes or rows; 0 where there is none."""
+    """A number of bytes or rows, by default 0."""
     value = record.get(name, 0)
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"{name}: {value!r} is no whole number")
@@ -167,7 +157,7 @@ def _finite(numbers: object, name: str) -> Float64:
 
 
 def _pieces(document: _Document, materials: dict[str, Paint], *, textures: bool) -> Iterator[_Piece]:
-    """All triangle primitives; their materials are collected in ``materials``."""
+    """All triangle primitives; their materials are added to ``materials``."""
     header = document.header
     nodes = header.get("nodes", [])
     roots = range(len(nodes))
@@ -198,7 +188,7 @@ def _transform(node: dict[str, Any], *, ours: bool) -> Float64:
     if "matrix" in node:
         return _finite(node["matrix"], "matrix").reshape(4, 4).T
     placed = np.eye(4)
-    if ours and "origin" in node.get("extras", {}):  # what positions are relative to, in input coordinates
+    if ours and "origin" in node.get("extras", {}):  # of the positions, in input coordinates
         placed[:3, 3] = _finite(node["extras"]["origin"], "origin")
         return placed
     turned = Rotation.from_quat(_finite(node.get("rotation", (0, 0, 0, 1)), "rotation")).as_matrix()
@@ -248,7 +238,7 @@ def _triangles(order: Int64, mode: int) -> Int64:
 
 
 def _texture_coordinates(document: _Document, attributes: dict[str, int], info: dict[str, Any]) -> Float64:
-    """Texture coordinates of the vertices, moved as KHR_texture_transform says."""
+    """Texture coordinates of the vertices, moved by KHR_texture_transform."""
     moved = info.get("extensions", {}).get("KHR_texture_transform", {})
     name = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
     if name not in attributes:
@@ -265,7 +255,7 @@ def _paint(document: _Document, material: dict[str, Any]) -> Paint:
     factor = _finite(material.get("baseColorFactor", (1, 1, 1, 1))[:3], "baseColorFactor").astype(np.float32)
     info = material.get("baseColorTexture")
     if info is None and (factor == 1).all():
-        return Paint(np.ones((1, 1, 3), np.float32))  # exactly, so that it is known for what it is
+        return Paint(np.ones((1, 1, 3), np.float32))  # exactly 1, which `_joined` looks for
     if info is None:
         return Paint(linear_to_srgb(factor.reshape(1, 1, 3)))
     texture = document.header["textures"][info["index"]]

@@ -1,4 +1,4 @@
-"""``TexturedMesh``: triangles with colours at their vertices or in images, and the lookup of those colours."""
+"""``TexturedMesh``: triangles with colours at their vertices or in images, and the lookup of colours."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color_space import linear_to_srgb, srgb_to_linear
+from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ..files import decode_image, rgb_and_alpha, unit_range
-
-__all__ = ["Paint", "Parts", "TexturedMesh", "colors_at", "decode_texture", "lookup", "pack"]
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -23,7 +21,7 @@ _WRAPS: tuple[Wrap, ...] = ("repeat", "clamp", "mirror")
 
 
 class Paint(NamedTuple):
-    """The image of one material: ``(h, w, 3)`` display RGB, and how it goes on beyond its sides along u and v."""
+    """The image of one material: ``(h, w, 3)`` display RGB, and its wrapping along u and v."""
 
     image: Float32
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
@@ -31,33 +29,27 @@ class Paint(NamedTuple):
 
 @dataclass(frozen=True)
 class Parts:
-    """Which rectangle of a mesh's image each face is painted with; u and v run over that rectangle.
+    """The rectangles of a mesh's image, one for each face; u and v run over the rectangle."""
 
-    Attributes:
-        face: ``(F,)`` number of the rectangle.
-        box: ``(M, 4)`` first row, first column, rows and columns of each rectangle, in texels.
-        wrap: ``(M, 2)`` how it goes on along u and v: 0 repeats, 1 repeats its border, 2 mirrors.
-    """
-
-    face: Int64
-    box: Int64
-    wrap: NDArray[np.int8]
+    face: Int64  # (F,) number of the rectangle
+    box: Int64  # (M, 4) first row, first column, rows and columns of each rectangle, in texels
+    wrap: NDArray[np.int8]  # (M, 2) along u and v: 0 repeats the image, 1 its border, 2 mirrors
 
 
 @dataclass(frozen=True)
 class TexturedMesh:
     """A triangle mesh in input coordinates, with its colours.
 
-    Where it has both an image and vertex colours, the colour is their product in linear light, as in glTF.
+    With both an image and vertex colours, the colour is their product in linear light, as in glTF.
 
     Attributes:
         vertices: ``(V, 3)``, in input units.
         faces: ``(F, 3)``; the two sides of a seam of the texture share their vertices.
-        uv: ``(F, 3, 2)`` texture coordinates of each corner; (0, 0) is the lower left corner of the image, v runs up.
+        uv: ``(F, 3, 2)`` texture coordinates of each corner; (0, 0) is the lower left corner of the image, v points up.
         image: ``(H, W, 3)`` display RGB in [0, 1], first row on top.
         vertex_colors: ``(V, 3)`` display RGB in [0, 1].
-        source: what messages call this mesh; the file's path, say.
-        parts: which part of the image belongs to which face; None: the whole image, repeated.
+        source: name in messages, such as the file's path.
+        parts: the part of the image of each face; None: the whole image, repeated.
 
     Raises:
         ValueError: an array has the wrong shape, or of ``uv`` and ``image`` there is only one.
@@ -86,7 +78,7 @@ class TexturedMesh:
 
     @property
     def has_colors(self) -> bool:
-        """Whether `colors_at` has anything to say."""
+        """Whether there is an image, or vertex colours."""
         return self.image is not None or self.vertex_colors is not None
 
 
@@ -95,8 +87,8 @@ def colors_at(mesh: TexturedMesh, face: Int64, barycentric: NDArray[np.floating]
 
     Args:
         mesh: with an image, vertex colours, or both.
-        face: ``(N,)`` faces.
-        barycentric: ``(N, 3)`` weights of their corners.
+        face: ``(N,)``.
+        barycentric: ``(N, 3)`` weights of the corners of the faces.
 
     Raises:
         ValueError: the mesh has no colours.
@@ -115,15 +107,10 @@ def colors_at(mesh: TexturedMesh, face: Int64, barycentric: NDArray[np.floating]
 
 
 def lookup(image: Float32, uv: Float64, parts: Parts | None = None, part: Int64 | None = None) -> Float32:
-    """Linear light ``(N, 3)`` of a display image at ``uv`` ``(N, 2)``, between the centres of its four nearest texels.
+    """Linear light ``(N, 3)`` of a display image at any ``uv`` ``(N, 2)``, bilinear between texel centres.
 
     Texel (row i, column j) of an H × W image has its centre at ``u = (j + 1/2) / W``, ``v = 1 - (i + 1/2) / H``.
-
-    Args:
-        image: ``(H, W, 3)``.
-        uv: v runs up; may lie outside [0, 1].
-        parts: rectangles of the image; None: it is one, and repeats.
-        part: ``(N,)`` which of them.
+    ``part`` ``(N,)`` are numbers of rectangles of ``parts``; without them the whole image repeats.
     """
     if parts is None or part is None:
         start, wrap = np.zeros(2, np.int64), np.zeros(2, np.int8)
@@ -143,19 +130,14 @@ def lookup(image: Float32, uv: Float64, parts: Parts | None = None, part: Int64 
 
 
 def _wrapped(index: Int64, size: Int64, wrap: NDArray[np.int8]) -> Int64:
-    """Indices ``(N, 2)`` of any size → those of texels."""
+    """Any indices ``(N, 2)`` → those of texels."""
     turn = index % (2 * size)
     mirrored = np.minimum(turn, 2 * size - 1 - turn)
     return np.where(wrap == 0, index % size, np.where(wrap == 1, index.clip(0, size - 1), mirrored))
 
 
 def pack(paints: Sequence[Paint], face: Int64) -> tuple[Float32, Parts]:
-    """Put the images of several materials one under the other.
-
-    Args:
-        paints: at least one.
-        face: ``(F,)`` which of them each face has.
-    """
+    """Stack the images of one or more materials into one; ``face`` ``(F,)`` is the material of each face."""
     sizes = np.array([paint.image.shape[:2] for paint in paints], np.int64)
     starts = np.cumsum(sizes[:, 0]) - sizes[:, 0]
     image = np.zeros((int(sizes[:, 0].sum()), int(sizes[:, 1].max()), 3), np.float32)
@@ -168,9 +150,5 @@ def pack(paints: Sequence[Paint], face: Int64) -> tuple[Float32, Parts]:
 
 
 def decode_texture(data: bytes) -> Float32:
-    """The bytes of an image file → ``(H, W, 3)`` display RGB in [0, 1]; its alpha channel is dropped.
-
-    Raises:
-        ValueError: it is no image, or of a kind we do not read.
-    """
+    """The bytes of an image file → ``(H, W, 3)`` display RGB in [0, 1], without its alpha channel."""
     return unit_range(rgb_and_alpha(decode_image(data))[0])

@@ -1,7 +1,6 @@
 """Wavefront OBJ with its materials: faces, texture coordinates of corners, MTL files and their images.
 
-Read here and not with trimesh, which splits vertices at seams. Of a material, ``map_Kd`` is its colour, and where
-that is missing ``Kd``; both are display colours.
+A material's colour is ``map_Kd``, or else ``Kd``; both are display colours. trimesh splits vertices at seams.
 """
 
 from __future__ import annotations
@@ -17,17 +16,15 @@ from ..clouds.readers.meshes import ObjText, triangulate
 from ..clouds.readers.tables import is_number
 from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 
-__all__ = ["read_textured_obj"]
-
 Float64 = NDArray[np.float64]
 
-# Options of map_Kd and how many words follow each; those with several numbers may have fewer.
+# Options of map_Kd, each with the largest number of words that follow.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1, "-clamp": 1}
 _OPTIONS |= {"-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1}
 
 
 class _Material(NamedTuple):
-    """What a material says: a colour, and perhaps an image with ``uv * scale + offset``."""
+    """The colour of a material, or its image at ``uv * scale + offset``."""
 
     color: tuple[float, ...] = (1.0, 1.0, 1.0)
     image: Path | None = None
@@ -37,11 +34,7 @@ class _Material(NamedTuple):
 
 
 def read_textured_obj(path: Path) -> TexturedMesh:
-    """Read the faces of an OBJ file with the images and colours of its materials, or the colours of its vertices.
-
-    Raises:
-        InputError: there are no faces, an index or number is wrong, or a material or an image is missing.
-    """
+    """The faces of an OBJ file with the images and colours of its materials, or the colours of its vertices."""
     obj = ObjText(path)
     if not len(obj.corners):
         raise InputError(f"{path}: f: no faces in it; a cloud has no texture, so give a mesh")
@@ -53,10 +46,10 @@ def read_textured_obj(path: Path) -> TexturedMesh:
 
     names, name_starts = obj.records("usemtl")
     materials = _materials(obj)
-    # Only images say more than vertex colours: a Kd beside them is what an exporter writes when it knows no better.
+    # Vertex colours go before Kd without images, which exporters write as a default.
     if not materials or (colors is not None and not any(material.image for material in materials.values())):
         return TexturedMesh(points, faces, None, None, colors, str(path))
-    # What is current where a polygon starts; faces before the first usemtl have the last entry, which is white.
+    # The last usemtl before a polygon; faces before the first usemtl have the last entry, which is white.
     used = np.searchsorted(name_starts, obj.used_at[triangles[:, 0]]) - 1
     number = {name: k for k, name in enumerate(materials)}
     unknown = next((name for name in names if name not in number), None)
@@ -156,7 +149,7 @@ def _with_map(material: _Material, words: str, file: Path, name: str) -> _Materi
 
 
 def _beside(file: Path, name: str) -> Path:
-    """A file named in another one; a path from somebody else's disc is looked for beside it."""
+    """A file named in another one, at its path or else beside it."""
     name = name.strip().strip('"').replace("\\", "/")
     relative = file.parent / name
     return relative if relative.is_file() else file.parent / name.rsplit("/", 1)[-1]

@@ -18,8 +18,6 @@ from .gltf import read_gltf
 from .mesh import TexturedMesh, colors_at
 from .obj import read_textured_obj
 
-__all__ = ["TEXTURED_READERS", "TexturedMesh", "colors_at", "read_textured", "sample_textured"]
-
 
 def read_textured(path: str | Path) -> TexturedMesh:
     """Read a mesh with its colours: from an image over texture coordinates, materials, or the vertices.
@@ -28,7 +26,7 @@ def read_textured(path: str | Path) -> TexturedMesh:
         path: an OBJ file with its MTL files and images, a GLB or glTF file, or a PLY file with vertex colours.
 
     Returns:
-        The mesh in input coordinates; vertices that a glTF file repeats along seams are one again.
+        The mesh in input coordinates, without repeated vertices along seams.
 
     Raises:
         InputError: the file, a material or an image is missing or damaged, or there are no faces or no colours.
@@ -50,12 +48,7 @@ def read_textured(path: str | Path) -> TexturedMesh:
 
 
 def sample_textured(mesh: TexturedMesh, count: int, *, seed: int) -> PointCloud:
-    """Points uniform by area, with the colours of the surface there and the normals of their faces.
-
-    Args:
-        mesh: with colours.
-        count: how many points.
-        seed: the same seed gives the same points.
+    """``count`` points uniform by area, with the colours of the surface and the normals of their faces.
 
     Raises:
         InputError: the faces have no area, or the mesh has no colours.
@@ -81,7 +74,7 @@ def _read_ply(path: Path) -> TexturedMesh:
 
 
 def _read_gltf(path: Path) -> TexturedMesh:
-    """Equal vertices become one; where their colours differ they stay two, so that no colour is lost."""
+    """A glTF mesh whose equal vertices with equal colours are merged."""
     mesh = read_gltf(path)
     colors = mesh.vertex_colors
     keys = mesh.vertices if colors is None else np.concatenate((mesh.vertices, colors), axis=1, dtype=np.float64)
@@ -93,4 +86,4 @@ def _read_gltf(path: Path) -> TexturedMesh:
 TEXTURED_READERS: Mapping[str, Callable[[Path], TexturedMesh]] = MappingProxyType(
     {".obj": read_textured_obj, ".glb": _read_gltf, ".gltf": _read_gltf, ".ply": _read_ply}
 )
-"""What reads which extension."""
+"""Readers by extension."""

@@ -1,4 +1,7 @@
-"""Posed photographs: pictures, the pinhole cameras that took them, and where the object is."""
+"""Posed photographs: pictures and masks without lens distortion, their cameras, and the region of the object.
+
+The readers do not apply EXIF orientations: the cameras of all formats belong to the pixels as stored.
+"""
 
 from __future__ import annotations
 
@@ -7,25 +10,26 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError, Similarity
-from ..cameras import Camera
-from ..files import readable
-from .formats.colmap import find_models, read_colmap_points
-from .formats.depth_maps import DepthMap, DepthSource, find_depth_maps, read_depth_map
-from .formats.neus import read_neus_sphere
-from .formats.reading import find_source, read_shots
-from .formats.shots import Shot, list_images
-from .pictures import read_mask, read_picture, resample, shrink, undistort, undistorted_camera
+from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
+from ..cameras import Camera, intrinsics
+from ..files import read_rgb, readable, unit_range
+from .formats.colmap import find_model, find_models, read_colmap, read_colmap_points
+from .formats.neus import read_neus, read_neus_sphere
+from .formats.shots import DepthMap, DepthSource, Shot, find_depth_maps, list_images, read_depth_map
+from .formats.transforms import read_transforms
 from .region import region_from_cameras, region_from_masks, region_from_points
 
-__all__ = ["PosedImage", "PosedImages", "read_posed_images"]
+FILES = ("cameras_sphere.npz", "transforms.json", "transforms_train.json")  # looked for in a folder, in this order
+OPAQUE = 0.999  # what is left of 1 after resampling
+EXACT = 0.01  # pixels that distorting an undistorted point may miss it by
 
 Float32 = NDArray[np.float32]
-
-OPAQUE = 0.999  # what is left of 1 after resampling
+Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +40,8 @@ class PosedImage:
         name: of its file, as the data set has it.
         camera: a pinhole of the picture's size.
         color: ``(H, W, 3)`` display RGB in [0, 1]; not multiplied by the mask.
-        mask: ``(H, W)`` how much of the pixel is object, in [0, 1]; None where nobody said.
-        depth: the depths that it shows, in pixels of their own; None where nobody measured.
+        mask: ``(H, W)`` the share of each pixel that is object, in [0, 1]; None if unknown.
+        depth: the measured depths, in pixels of their own; None if there are none.
     """
 
     name: str
@@ -54,11 +58,11 @@ class PosedImages:
     Attributes:
         views: at least one.
         similarity: from world coordinates to the unit sphere around the region of interest.
-        region: where that came from, in words.
+        region: the source of the similarity, in words.
         points: ``(P, 3)`` sparse points of the surface in world coordinates, or None.
         source: the file that the cameras were read from; for COLMAP the folder of the model.
-        observations: ``(K, 2)`` which view saw which point: their numbers; None where nobody said.
-        reading: one line about which photographs have a camera.
+        observations: ``(K, 2)`` numbers of a view and of a point that it shows; None if unknown.
+        reading: one line about the photographs that have a camera.
     """
 
     views: tuple[PosedImage, ...]
@@ -78,33 +82,27 @@ def read_posed_images(
     depths: DepthSource | None = None,
     allow_missing: bool = False,
 ) -> PosedImages:
-    """Read photographs, their cameras, masks and depth maps, and find out where the object is.
+    """Read photographs, their cameras, masks and depth maps, and find the region of the object.
 
-    Lens distortion is taken out of the pictures, and the cameras are those of the new pictures. Where a picture is
-    larger or smaller than its file of cameras says, both sides by one factor, the camera follows. A picture's mask is
-    the file that goes with it, or its transparency; masks that are white in all views are none.
+    Lens distortion is taken out of the pictures, and the cameras are those of the new pictures. If a picture is larger
+    or smaller than its file of cameras says, both sides by one factor, its camera is resized. A picture's mask is the
+    file that goes with it, or its transparency. Masks that are white in all views are ignored.
 
     Args:
         path: a file or folder that `read_cameras` knows: NeuS (with ``image`` and ``mask`` beside cameras_sphere.npz),
             transforms.json, COLMAP (``sparse/0`` with ``images`` beside it).
-        width: pictures that are wider are shrunk to this, in pixels, in linear light; none is enlarged.
+        width: wider pictures are shrunk to this width in pixels, in linear light.
         region: the sphere around the object. By default that of ``scale_mat_i``, of the masks' visual hull, of the
             sparse points, or that which the cameras look at: the first that there is.
-        depths: where depth maps are, and what they hold; by default those that a transforms.json names
-            (``depth_file_path``, ``depth_path``), in the units of the cameras.
-        allow_missing: whether to go on where fewer than half of the photographs have a camera, and without the
-            cameras whose photograph, mask or depth map is missing.
+        depths: the depth maps; by default those that a transforms.json names (``depth_file_path``, ``depth_path``), in
+            the units of the cameras.
+        allow_missing: whether to accept that fewer than half of the photographs have a camera, and to leave out cameras
+            whose photograph, mask or depth map is missing.
 
     Raises:
         InputError: a file is missing or damaged, a picture and its camera, mask or depth map do not go together, a
-            lens cannot be undistorted, or nothing says where the object is.
+            lens cannot be undistorted, or the region cannot be found.
         ValueError: ``width`` is not positive.
-
-    Example:
-        >>> read_posed_images("photos")
-        Traceback (most recent call last):
-        ...
-        mplicits.neural_fields.backend.errors.InputError: photos: no such file; check the path
     """
     if width is not None and width < 1:
         raise ValueError(f"width={width}: expected at least one pixel")
@@ -148,11 +146,7 @@ def _missing(shot: Shot) -> bool:
 
 
 def _counted(source: Path, shots: Sequence[Shot], placed: int, *, allow_missing: bool) -> str:
-    """One line about how many photographs there are, and how many of them have a camera.
-
-    Raises:
-        InputError: fewer than half, or none.
-    """
+    """One line: the number of photographs, and of those that have a camera; an InputError if these are too few."""
     photographs = len({shot.image for shot in shots})
     folders = {shot.image.parent for shot in shots}
     if source.is_dir() or source.name == "transforms.json":  # others hold a choice on purpose: training views, say
@@ -170,7 +164,7 @@ def _counted(source: Path, shots: Sequence[Shot], placed: int, *, allow_missing:
 
 
 def _check_files(shots: Sequence[Shot]) -> None:
-    """Say before any long work what is missing."""
+    """Refuse missing files before any long work."""
     fixes = {
         "image": "add it, or leave that camera out: --allow-missing",
         "mask": "add it, or leave all masks out",
@@ -226,7 +220,7 @@ def _fitted(shot: Shot, width: int, height: int) -> Camera:
 def _find_region(
     views: Sequence[PosedImage], points: NDArray[np.float64] | None, source: Path
 ) -> tuple[Similarity, str]:
-    """The first of masks, sparse points and cameras that says where the object is, and which it was."""
+    """The region from masks, sparse points or cameras, the first that succeeds, and its source in words."""
     cameras = [view.camera for view in views]
     masks = [view.mask for view in views if view.mask is not None]
     tries: list[tuple[str, Callable[[], Similarity]]] = []
@@ -244,3 +238,127 @@ def _find_region(
                 refused.append(str(error))
     fix = "take more views, from other sides, or give it: scale_mat_i of NeuS's files, or region= in Python"
     raise InputError(f"{source}: region: not found ({'; '.join(refused)}); {fix}")
+
+
+def read_cameras(path: str | Path) -> list[tuple[str, Camera]]:
+    """Read the cameras of posed images, with the images' names, in the file's own world coordinates.
+
+    Lens distortion is ignored: the cameras are those of undistorted images. `read_posed_images` undistorts both.
+
+    - ``*.json``: transforms.json of nerfstudio, instant-ngp and the Blender scenes of NeRF. ``transform_matrix`` is
+      the pose in OpenGL's convention (x right, y up, z backward) and becomes OpenCV's. The focal length is ``fl_x``,
+      ``fl_y`` or ``camera_angle_x``; ``cx`` and ``cy`` count from the image's corner, so half a pixel is taken off; all
+      may stand at the top or in a frame. Without ``w`` and ``h`` the size is that of the image.
+    - ``*.npz``: NeuS and IDR; ``world_mat_i`` projects onto pixels and is decomposed. The i-th image in name order of
+      the folder ``image`` beside the file gives name and size.
+    - a folder: one of these in it (cameras_sphere.npz, transforms.json, transforms_train.json), or a COLMAP model,
+      text or binary: the largest in ``sparse/*``, or that in ``sparse`` or the folder itself.
+
+    Raises:
+        InputError: the file is missing, damaged or of another kind, or a camera in it is impossible.
+    """
+    return [(shot.name, shot.camera.pinhole()) for shot in read_shots(find_source(path))]
+
+
+def find_source(path: str | Path) -> Path:
+    """The file of cameras of a path: itself, or what is found in the folder; for COLMAP the model's folder."""
+    path = Path(path)
+    if path.is_dir():
+        found = next((path / name for name in FILES if (path / name).is_file()), None) or find_model(path)
+        if found is None:
+            raise InputError(f"{path}: none of {', '.join(FILES)} or a COLMAP model (sparse/*) in it; name the file")
+        return found
+    if not path.exists():
+        raise InputError(f"{path}: no such file; check the path")
+    if path.suffix.lower() not in (".json", ".npz"):
+        known = "cameras are read from .json, .npz and the folders of COLMAP models"
+        raise InputError(f"{path}: unknown extension {path.suffix!r}; {known}")
+    return path
+
+
+def read_shots(source: Path) -> list[Shot]:
+    """The photographs of what `find_source` found."""
+    with readable(source):
+        if source.is_dir():
+            return read_colmap(source)
+        return read_neus(source) if source.suffix.lower() == ".npz" else read_transforms(source)
+
+
+def read_picture(path: Path) -> tuple[Float32, Float32 | None]:
+    """A picture of 8 or 16 bits → ``(H, W, 3)`` display RGB, not multiplied by its opacity ``(H, W)``, if any."""
+    color, opacity = read_rgb(path)
+    return unit_range(color), None if opacity is None else unit_range(opacity)
+
+
+def read_mask(path: Path) -> Float32:
+    """A mask of any bit depth, grey or RGB → ``(H, W)``: 1 where it is more than half of white, else 0.
+
+    In a file whose largest number is 1, white is 1.
+    """
+    image, _ = read_rgb(path)
+    white = 1 if image.max() <= 1 else np.iinfo(image.dtype).max
+    return (image.max(axis=2) > white / 2).astype(np.float32)
+
+
+def resample(color: Float32, alpha: Float32 | None, change: Callable[[Float32], Float32]) -> tuple[Float32, Float32]:
+    """Average pixels in linear light, weighted by opacity → display RGB and opacity of the new picture.
+
+    ``change`` makes of an image ``(H, W, 4)`` another, each of whose pixels is a weighted average.
+    """
+    weight = np.ones(color.shape[:2], np.float32) if alpha is None else alpha
+    light = np.dstack((srgb_to_linear(color) * weight[..., None], weight))
+    changed = change(light)
+    opacity = changed[..., 3]
+    mean = changed[..., :3] / np.where(opacity > 0, opacity, 1)[..., None]
+    return linear_to_srgb(mean.clip(0, 1)).astype(np.float32), opacity.clip(0, 1)
+
+
+def shrink(image: Float32, width: int, height: int) -> Float32:
+    """A smaller picture ``(height, width, ...)``, averaged over the areas of its pixels."""
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def undistorted_camera(camera: Camera) -> Camera:
+    """The pinhole at the same place, with as many pixels, all of which the distorted image covers.
+
+    Its image is the largest rectangle, in the plane at depth 1, with none of the distorted image's border inside it. A
+    ValueError says that the distortion folds the image over.
+    """
+    if not camera.distortion:
+        return camera
+    across, down = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
+    right, bottom = np.float64(camera.width - 1), np.float64(camera.height - 1)
+    x0, x1 = (_border(camera, np.broadcast_to(x, down.shape), down)[:, 0] for x in (0 * right, right))
+    y0, y1 = (_border(camera, across, np.broadcast_to(y, across.shape))[:, 1] for y in (0 * bottom, bottom))
+    (left, width), (top, height) = (x0.max(), x1.min() - x0.max()), (y0.max(), y1.min() - y0.max())
+    if not (width > 0 and height > 0):
+        raise ValueError(f"distortion={camera.distortion}: leaves nothing of the image")
+    fx, fy = right / width, bottom / height
+    pinhole = replace(camera, intrinsics=intrinsics(fx, fy, -fx * left, -fy * top), distortion=())
+    x, y = _maps(camera, pinhole)
+    # Where neighbours change places, two directions share a pixel.
+    if np.diff(x, axis=1).min() <= 0 or np.diff(y, axis=0).min() <= 0:
+        raise ValueError(f"distortion={camera.distortion}: folds the image over")
+    return pinhole
+
+
+def undistort(image: Float32, camera: Camera, pinhole: Camera) -> Float32:
+    """The image of ``pinhole``, interpolated linearly from the distorted ``image`` ``(H, W)`` or ``(H, W, C)``."""
+    x, y = _maps(camera, pinhole)
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+
+
+def _maps(camera: Camera, pinhole: Camera) -> tuple[Float32, Float32]:
+    """The places x and y in the distorted picture of the pinhole's pixels, ``(H, W)`` each."""
+    size, target = (pinhole.width, pinhole.height), pinhole.intrinsics.numpy()
+    x, y = cv2.initUndistortRectifyMap(*camera.for_opencv, np.eye(3), target, size, cv2.CV_32FC1)
+    return np.asarray(x, np.float32), np.asarray(y, np.float32)
+
+
+def _border(camera: Camera, x: Float64, y: Float64) -> Float64:
+    """The slopes ``(N, 2)`` at pixels x, y ``(N,)``; a ValueError if they do not lead back to the pixels."""
+    pixels = np.stack((x, y), axis=1)
+    slopes = camera.slopes_at(pixels)
+    if not np.abs(camera.pixels_at(slopes) - pixels).max() < EXACT:
+        raise ValueError(f"distortion={camera.distortion}: cannot be undone at the image's border")
+    return slopes

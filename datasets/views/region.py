@@ -1,4 +1,4 @@
-"""Where the object is, that posed photographs show: a sphere from cameras, sparse points, or masks."""
+"""The region of the object in posed photographs: a sphere from cameras, sparse points, or masks."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ...neural_fields import Similarity
 from ..cameras import Camera
 
-__all__ = ["region_from_cameras", "region_from_masks", "region_from_points"]
-
 Float64 = NDArray[np.float64]
 
 
@@ -22,15 +20,14 @@ Float64 = NDArray[np.float64]
 class RegionOptions:
     """How the sphere around the object is found."""
 
-    parallel: float = 1e-6  # squared sine between axes of view below which they meet nowhere
-    clear: float = 0.9  # of the distance to the nearest camera, that the sphere may reach to
-    margin: float = 1.05  # by how much the sphere is larger than what it is put around
+    parallel: float = 1e-6  # squared sine between axes of view below which they count as parallel
+    clear: float = 0.9  # largest radius, as a share of the distance to the nearest camera
+    margin: float = 1.05  # radius over that of what the sphere encloses
     cells: int = 64  # of the grid of the visual hull, along each side
-    # One view in so many may take for background what is in the hull; of so few views, one if else there were none.
-    one_in: int = 20
-    few: int = 4
-    fewest: int = 8  # points or grid points that say where something is
-    tail: float = 0.02  # share of the sparse points on either side that are not trusted
+    one_in: int = 20  # one view in so many may miss a part of the hull
+    few: int = 4  # views from which one may miss a part, if the hull is empty otherwise
+    fewest: int = 8  # points, of the cloud or of the grid
+    tail: float = 0.02  # share of the sparse points that is ignored on either side
 
 
 REGION = RegionOptions()
@@ -39,11 +36,9 @@ REGION = RegionOptions()
 def region_from_cameras(cameras: Sequence[Camera]) -> Similarity:
     """The sphere that the cameras look at.
 
-    Its centre is the point c with the least sum of squared distances to the axes of view,
-    ``Σ (I − d dᵀ)(c − eye) = 0``. Its radius is the median, over the cameras, of that of the sphere at the distance of
-    c that just fits between the ends of the picture's longer side, wherever in the picture c is. (People frame an
-    object so that it fills the picture; a sphere that fits into the shorter side would cut it.) The radius is at most
-    0.9 of the distance from c to the nearest camera, so that no camera is inside.
+    Its centre c has the least sum of squared distances to the axes of view, ``Σ (I − d dᵀ)(c − eye) = 0``. Each camera
+    gives the radius of the sphere around c that just fits the longer side of its picture. The median of these is taken,
+    but at most 0.9 of the distance from c to the nearest camera.
 
     Raises:
         ValueError: the axes of view are parallel, or half of the cameras have the centre behind them or out of view.
@@ -69,8 +64,8 @@ def region_from_points(points: Float64, cameras: Sequence[Camera]) -> Similarity
     """The sphere around the sparse points ``(P, 3)`` that most cameras share.
 
     Points count if at least half of the cameras have them in view, and if they are nearer to the point that the cameras
-    look at than the median camera is: what is further away is background. The centre is the middle of the box
-    between the 2 % and 98 % quantiles along the axes, the radius 1.05 times the 98 % quantile of the distances from it.
+    look at than the median camera: the rest is background. The centre is the middle of the box between the 2 % and 98 %
+    quantiles along the axes. The radius is 1.05 times the 98 % quantile of the distances from it.
 
     Raises:
         ValueError: fewer than eight points are left, or all of them coincide.
@@ -96,12 +91,12 @@ def region_from_points(points: Float64, cameras: Sequence[Camera]) -> Similarity
 
 
 def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.floating]]) -> Similarity:
-    """The sphere around the visual hull: the points that are object in the views that have them in the picture.
+    """The sphere around the visual hull: the points that are object in all views that have them in the picture.
 
-    One view in twenty may differ, since the hull of all would lack what one mask lacks; of four views or more one, if
-    else there were no hull. Points of a grid of 64³ are tried, first in the cube around twice the sphere of
-    `region_from_cameras`, then in the box of those that are left. At least half of the views must have a point in the
-    picture. The sphere is centred on the box of the hull, and reaches a step of the grid and 5 % beyond it.
+    One view in twenty may differ, because one mask may lack a part; of four views or more one, if the hull is empty
+    otherwise. At least half of the views must have a point in the picture. The hull is sampled on a grid of 64³, first
+    in the cube around twice the sphere of `region_from_cameras`, then in the box of the points that are left. The
+    sphere is centred on the box of the hull, and reaches a step of the grid and 5 % beyond it.
 
     Args:
         cameras: V of them.
@@ -162,7 +157,7 @@ def _view_radius(camera: Camera, center: Float64) -> float:
 
 
 def _clearances(place: float, z: float, low: float, high: float) -> tuple[float, float]:
-    """How far (place, z) is inside either side of the wedge with slopes low and high and its edge at the origin."""
+    """Distances of (place, z) from the sides of the wedge with slopes low and high and its edge at the origin."""
     return (place - low * z) / math.hypot(1, low), (high * z - place) / math.hypot(1, high)
 
 

@@ -1,7 +1,6 @@
-"""Posed images out, in the layouts that NeuS, nerfstudio and COLMAP read: the inverses of our readers.
+"""Writers of posed images in the layouts of NeuS, nerfstudio and COLMAP; a folder appears when it is complete.
 
-Images are PNG files of 8 bits, numbered from 000 in the order of the views. A folder appears under its name only
-when it is complete. Depth maps become NPY files in ``depths/``, in all layouts.
+Images are PNG files of 8 bits, numbered from 000 in the order of the views. Depth maps are NPY files in ``depths/``.
 """
 
 from __future__ import annotations
@@ -25,8 +24,6 @@ from ...neural_fields.backend.files import check_place
 from ..cameras import Camera
 from .images import PosedImage, PosedImages
 
-__all__ = ["check_new_folder", "write_colmap", "write_neus", "write_transforms"]
-
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
@@ -36,11 +33,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's axes (y up, z backward
 
 
 def check_new_folder(path: str | Path) -> Path:
-    """Whether a folder can be made at ``path``, to be asked before any long work.
-
-    Raises:
-        InputError: something stands there already (an empty folder may), or none can be made (`check_place`).
-    """
+    """The path, if a new folder can be made there or an empty one is there; else an InputError."""
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; name a folder that does not exist yet")
@@ -75,9 +68,8 @@ def write_neus(folder: str | Path, images: PosedImages) -> None:
 def write_transforms(folder: str | Path, images: PosedImages) -> None:
     """Write ``transforms.json`` and ``images/``, as nerfstudio and instant-ngp read them.
 
-    Poses are in OpenGL's convention and ``cx``, ``cy`` count from the image's corner. Masks become the alpha channel
-    (straight). Every frame has its own intrinsics; ``camera_angle_x`` of the first stands at the top, for readers of
-    Blender's dialect.
+    Poses are in OpenGL's convention, and ``cx``, ``cy`` count from the image's corner. Masks become the alpha channel
+    (straight). Every frame has its own intrinsics; ``camera_angle_x`` at the top is that of the first.
 
     Raises:
         InputError: the folder is not new, or cannot be written.
@@ -102,8 +94,8 @@ def write_transforms(folder: str | Path, images: PosedImages) -> None:
 def write_colmap(folder: str | Path, images: PosedImages, *, form: Literal["text", "binary"] = "binary") -> None:
     """Write ``images/`` and a sparse model in ``sparse/0``, as COLMAP writes them.
 
-    Cameras are PINHOLE, one for each distinct lens. Masks become the alpha channel (straight). Which views saw a sparse
-    point is written where it is known, with the place in the image to which the point projects.
+    Cameras are PINHOLE, one for each distinct lens. Masks become the alpha channel (straight). Observations of sparse
+    points are written at the places to which the points project.
 
     Raises:
         InputError: the folder is not new, or cannot be written.
@@ -126,30 +118,21 @@ _Place = tuple[str, int, list[float], list[float]]
 
 
 class _Observations(NamedTuple):
-    """Which view saw which sparse point, and where; ``(K,)`` each, view by view.
-
-    Attributes:
-        view: number from 0.
-        point: number from 0.
-        pixel: ``(K, 2)`` in the view's image, from its corner.
-        order: number from 0 among those of the view.
-    """
+    """The sparse points that each view shows; ``(K,)`` each, view by view, numbers from 0."""
 
     view: Int64
     point: Int64
-    pixel: Float64
-    order: Int64
+    pixel: Float64  # (K, 2) in the view's image, from its corner
+    order: Int64  # number among the points of the view
 
     def of_view(self, view: int) -> list[tuple[float, float, int]]:
-        """Its places x, y in the image, each with the number of the point, from 1."""
+        """Places x, y in the image of a view, each with the number of the point, from 1."""
         rows = self.view == view
-        return [
-            (*pixel, point + 1)
-            for pixel, point in zip(self.pixel[rows].tolist(), self.point[rows].tolist(), strict=True)
-        ]
+        pairs = zip(self.pixel[rows].tolist(), self.point[rows].tolist(), strict=True)
+        return [(*pixel, point + 1) for pixel, point in pairs]
 
     def tracks(self, points: int) -> list[list[int]]:
-        """Of each point the views that saw it, from 1, each followed by the order there."""
+        """For each point the views that show it, from 1, each followed by the order there."""
         found: list[list[int]] = [[] for _ in range(points)]
         for view, point, order in zip(self.view.tolist(), self.point.tolist(), self.order.tolist(), strict=True):
             found[point] += [view + 1, order]
@@ -229,7 +212,7 @@ def _words(numbers: list[float]) -> str:
 
 
 def _numbered(images: PosedImages) -> Iterator[tuple[str, PosedImage]]:
-    """The views with the names of their files; as text, the names are in the order of the views."""
+    """The views with the names of their files, which sort in the order of the views."""
     digits = max(3, len(str(len(images.views) - 1)))
     return ((f"{index:0{digits}d}.png", view) for index, view in enumerate(images.views))
 
@@ -250,7 +233,7 @@ def _write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
 
 
 def _depth_file(name: str) -> Path:
-    """Of the depth map of the image with that name, in the folder of the data set."""
+    """The depth map of an image, relative to the folder of the data set."""
     return Path("depths", name).with_suffix(".npy")
 
 

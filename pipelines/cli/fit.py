@@ -182,7 +182,7 @@ def _tell_outcome(outcome: FitOutcome) -> None:
 def _depth_input(arguments: argparse.Namespace, cloud: str) -> DepthInput | None:
     """The depth maps that the arguments name; None if CLOUD is a cloud, which flags of depth maps do not go with."""
     from ...datasets import DepthSettings, is_depth_file
-    from ...datasets.depth.images import DEPTH_SUFFIXES
+    from ...datasets.files import DEPTH_SUFFIXES
     from ..fit.depth import DepthInput
 
     given = [

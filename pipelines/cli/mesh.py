@@ -96,7 +96,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     if arguments.photos is None:
         metrics = evaluate_files(arguments.mesh, arguments.reference, **options)
     else:
-        from ...datasets.views.formats.reading import read_cameras
+        from ...datasets.views.images import read_cameras
         from ..reconstruct.data.visibility import count_views
         from ..training.progress import counter_bar
 

@@ -116,7 +116,7 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _check_cameras(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".glb", ".ply"))
-    from ...datasets.views.formats.depth_maps import DepthSource
+    from ...datasets.views.formats.shots import DepthSource
     from ..reconstruct.checks.check import check_files
 
     depths = DepthSource(arguments.depth_maps, arguments.depth_kind, arguments.depth_scale)

@@ -28,8 +28,8 @@ from torch import Tensor
 from ...datasets import PointCloud, read_cloud
 from ...datasets.clouds.cleaning.dipoles import DipoleField
 from ...datasets.clouds.large import Merging, merge_cloud
+from ...datasets.clouds.readers.columns import CloudStream, MemoryStream
 from ...datasets.clouds.readers.reading import check_cloud, open_stream
-from ...datasets.clouds.readers.stream import CloudStream, MemoryStream
 from ...neural_fields.backend.files import whole_file
 from ..training.folder import MERGED_FILE
 

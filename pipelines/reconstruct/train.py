@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ...datasets import PointCloud
-from ...datasets.views.formats.depth_maps import DepthSource
+from ...datasets.views.formats.shots import DepthSource
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import Field, InputError, Jet, NoSurfaceError, TextureField, extract_mesh
 from ...neural_fields.checkpoint import radiance_bytes, texture_bytes

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.cameras import Camera
-from ...datasets.views.images import PosedImage
-from ...datasets.views.pictures import resample, shrink
+from ...datasets.views.images import PosedImage, resample, shrink
 from ...neural_fields import Similarity
 from ...neural_fields.volume.render import Sampling
 from ...neural_fields.volume.weights import sphere_span

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...datasets.cameras import Camera, turntable
 from ...datasets.textured.mesh import TexturedMesh
-from ...datasets.views.formats.reading import read_cameras
+from ...datasets.views.images import read_cameras
 from ...neural_fields import Field, InputError, Similarity, WorldField
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS

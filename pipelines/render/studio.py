@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from ...datasets.cameras import Camera
 from ...datasets.clouds.readers.meshes import vertex_normals
-from ...datasets.color_space import srgb_to_linear
-from ...datasets.synthetic.studio import cameras_around, developed, lit
+from ...datasets.synthetic.scenes import cameras_around, developed, lit
 from ...datasets.textured.mesh import TexturedMesh
-from ...datasets.views.formats.depth_maps import DepthMap
+from ...datasets.views.formats.shots import DepthMap
 from ...datasets.views.images import PosedImage, PosedImages
 from ...neural_fields import InputError, Mesh, Similarity
+from ...neural_fields.meshing.color_space import srgb_to_linear
 from ..surface.surface import read_reference, sample_points
 from .rasterise import Painted, mesh_view, read_painted
 from .trace import Seen, fine_strips

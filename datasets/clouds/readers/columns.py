@@ -1,12 +1,10 @@
-"""Which columns of a table hold points, normals and colours: by their names, or by what their values can be.
-
-All table formats (text, NPY, NPZ, PLY, PCD, LAS) use the same rules, and all report them in one line.
-"""
+"""Tables of points (text, NPY, NPZ, PLY, PCD, LAS): what their columns hold, and clouds that are read in pieces."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,44 +15,35 @@ from numpy.typing import NDArray
 from ....neural_fields import InputError
 from ..point_cloud import PointCloud, colors_from, normals_from
 
-__all__ = ["Layout", "Table", "Triple", "choose_layout", "cloud_from", "describe_layout", "named_layout", "sampled"]
-
 Triple = tuple[int, int, int]
 
 
 class Layout(NamedTuple):
-    """Columns of a table by what they hold.
+    """Columns of a table by what they hold."""
 
-    Attributes:
-        points: numbers of the columns x, y, z.
-        normals: those of the normals, or None.
-        colors: those of red, green and blue, or None.
-        guessed: whether the values decided, since there are no names.
-    """
-
-    points: Triple
+    points: Triple  # numbers of the columns x, y, z
     normals: Triple | None = None
     colors: Triple | None = None
-    guessed: bool = False
+    guessed: bool = False  # whether the values decided, since there are no names
+
+
+class RawRows(NamedTuple):
+    """Points as a file holds them: ``(n, 3)`` each, of any type of number."""
+
+    points: NDArray[Any]  # may hold NaN
+    normals: NDArray[Any] | None  # of any length
+    colors: NDArray[Any] | None  # see `colors_from`
 
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of numbers as a file holds them.
-
-    Attributes:
-        path: the file.
-        columns: arrays ``(N,)``, one per column, or one array ``(N, C)``.
-        names: of the columns, as the file has them; None where it has none.
-        where: place in the file, for messages (``"line 3: "``).
-        notes: what else the reader left out, for the report.
-    """
+    """Columns of numbers as a file holds them: arrays ``(N,)``, or one array ``(N, C)``."""
 
     path: Path
     columns: Sequence[NDArray[Any]] | NDArray[Any]
-    names: Sequence[str] | None = None
-    where: str = ""
-    notes: tuple[str, ...] = ()
+    names: Sequence[str] | None = None  # as the file has them; None where it has none
+    where: str = ""  # place in the file, for messages (``"line 3: "``)
+    notes: tuple[str, ...] = ()  # what else the reader left out, for the report
 
     @property
     def width(self) -> int:
@@ -67,6 +56,11 @@ class Table:
             first, run = which[0], list(range(which[0], which[0] + len(which)))
             return self.columns[:, first : first + len(which)] if list(which) == run else self.columns[:, list(which)]
         return np.stack([self.columns[k] for k in which], axis=1)
+
+    def rows(self, layout: Layout) -> RawRows:
+        """The points, and the normals and colours where there are any."""
+        normals, colors = (None if which is None else self.pick(which) for which in (layout.normals, layout.colors))
+        return RawRows(self.pick(layout.points), normals, colors)
 
 
 # Names without case, units, marks, and the words `_FILLERS`; what comes first counts.
@@ -107,18 +101,10 @@ def named_layout(names: Sequence[str]) -> Layout | None:
 
 
 def choose_layout(table: Table, columns: str | None = None, *, scanner: bool = False) -> Layout:
-    """Columns by request, by name, or by position where the values allow only one reading.
+    """Columns by request (``x,y,z,nx,ny,nz,r,g,b,-``), by name, or by position where the values allow one reading.
 
-    Without names, x, y and z come first. What follows is normals of unit length, colours (fractions, or whole numbers
-    up to 255 or 65535), and at most one more column; opacity may follow colours.
-
-    Args:
-        table: the columns, or some rows of them.
-        columns: names of all columns, separated by commas, ``-`` for one to ignore: ``x,y,z,nx,ny,nz,r,g,b,-``.
-        scanner: whether the file is a scanner's (PTS), in which intensity comes before colours.
-
-    Raises:
-        InputError: ``columns`` does not fit, x, y or z is missing, or the values allow no reading, or several.
+    Without names, x, y and z come first. Then come unit normals, colours (fractions, or whole numbers of 8 or 16 bits,
+    perhaps with opacity), and at most one more column. In a ``scanner``'s file (PTS), intensity comes before colours.
     """
     if columns is not None:
         return _requested(table, columns)
@@ -223,16 +209,19 @@ def _are_colors(three: NDArray[np.float64]) -> bool:
 
 
 def cloud_from(table: Table, layout: Layout) -> PointCloud:
-    """The cloud in these columns, with one line about what became of each."""
-    normals = None if layout.normals is None else normals_from(table.pick(layout.normals))
-    colors = None if layout.colors is None else colors_from(table.pick(layout.colors))
-    points = np.ascontiguousarray(table.pick(layout.points), np.float64)
-    reading = describe_layout(table, layout, len(points))
-    return PointCloud(points, normals, colors, str(table.path), reading=reading)
+    """The cloud in these columns, with one line about each column."""
+    points, normals, colors = table.rows(layout)
+    return PointCloud(
+        np.ascontiguousarray(points, np.float64),
+        None if normals is None else normals_from(normals),
+        None if colors is None else colors_from(colors),
+        str(table.path),
+        reading=describe_layout(table, layout, len(points)),
+    )
 
 
 def describe_layout(table: Table, layout: Layout, count: int) -> str:
-    """One line: how many points, where normals and colours come from, and what is ignored."""
+    """One line: the number of points, the columns of normals and colours, and the columns that are ignored."""
     names = [f"column {k + 1}" for k in range(table.width)] if table.names is None else table.names
     used = {"normals": layout.normals, "colors": layout.colors}
     parts = [f"{count:,} points"]
@@ -242,3 +231,55 @@ def describe_layout(table: Table, layout: Layout, count: int) -> str:
     if others:
         parts.append(f"ignored: {', '.join(others[:8])}" + f" and {len(others) - 8} more" * (len(others) > 8))
     return "; ".join([*parts, *table.notes])
+
+
+class CloudStream(ABC):
+    """A cloud that is read in pieces, as often as needed."""
+
+    source: str  # the name used in messages
+    count: int  # points in the file; pieces may leave some of them out
+    reading: str = ""  # see `PointCloud`
+
+    @abstractmethod
+    def pieces(self, rows: int) -> Iterator[RawRows]:
+        """All points in their order, up to ``rows`` at a time."""
+
+
+class MemoryStream(CloudStream):
+    """A cloud that is in memory already."""
+
+    def __init__(self, cloud: PointCloud) -> None:
+        self.cloud, self.source, self.count, self.reading = cloud, cloud.source, len(cloud), cloud.reading
+
+    def pieces(self, rows: int) -> Iterator[RawRows]:
+        """See `CloudStream.pieces`."""
+        arrays = (self.cloud.points, self.cloud.normals, self.cloud.colors)
+        for start in range(0, self.count, rows):
+            points, normals, colors = (None if a is None else a[start : start + rows] for a in arrays)
+            assert points is not None
+            yield RawRows(points, normals, colors)
+
+
+class TableStream(CloudStream):
+    """Rows of one size in a file, which are mapped into memory one piece at a time.
+
+    ``offset`` is the byte at which the rows begin. ``row`` is the type of a row: a structure, or ``(">f4", (6,))``.
+    """
+
+    def __init__(self, table: Table, *, offset: int, row: np.dtype[Any], count: int, layout: Layout) -> None:
+        path = table.path
+        if path.stat().st_size < offset + count * row.itemsize:
+            raise InputError(
+                f"{path}: vertex: the file ends before its {count} rows do (truncated?); copy or export it again"
+            )
+        self.path, self.source, self.count = path, str(path), count
+        self.reading = describe_layout(table, layout, count)
+        self.offset, self.row, self.layout = offset, row, layout
+
+    def pieces(self, rows: int) -> Iterator[RawRows]:
+        """See `CloudStream.pieces`; the pages of a piece are given back when its arrays go."""
+        for start in range(0, self.count, rows):
+            at = self.offset + start * self.row.itemsize
+            raw = np.memmap(self.path, self.row, "r", at, (min(rows, self.count - start),))
+            names = raw.dtype.names
+            yield Table(self.path, raw if names is None else [raw[name] for name in names]).rows(self.layout)

@@ -12,15 +12,9 @@ from ....neural_fields import InputError
 from ..point_cloud import PointCloud
 from .columns import Table, choose_layout, cloud_from
 
-__all__ = ["read_e57"]
-
 
 def read_e57(path: Path, columns: str | None = None) -> PointCloud:
-    """Read all scans of an E57 file in their common coordinates, with the colours that all of them have.
-
-    Raises:
-        InputError: pye57 is not installed, it cannot read the file, or there is no scan.
-    """
+    """All scans of an E57 file in their common coordinates, with the colours that all of them have."""
     try:
         import pye57
     except ImportError as error:

@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 
 from ....neural_fields import InputError
 from ..point_cloud import PointCloud, colors_from
-from .columns import Layout, Table, Triple, describe_layout, named_layout
-from .stream import CloudStream, RawRows
-
-__all__ = ["LasStream", "read_las"]
+from .columns import CloudStream, Layout, RawRows, Table, describe_layout, named_layout
 
 # Of the public header (LAS 1.4 R15, 2.4): version, sizes, how many records and points; the last part is of 1.4 alone.
 _VERSION = struct.Struct("<BB"), 24
@@ -25,15 +22,9 @@ _SIZES_14 = struct.Struct("<QIQ"), 235
 
 
 class LasStream(CloudStream):
-    """A LAS or LAZ file, read in pieces. Points that are marked as withheld are left out.
+    """A LAS or LAZ file, read in pieces, without the points that are marked as withheld.
 
-    Args:
-        path: the file.
-        columns: refused: LAS files name their columns.
-        drop_noise: whether points of the classes for noise (7 and 18) are left out too.
-
-    Raises:
-        InputError: laspy is not installed, or it cannot read the file; also while pieces are read.
+    ``columns`` are refused, since LAS files name them; ``drop_noise`` leaves out the classes for noise (7 and 18).
     """
 
     def __init__(self, path: Path, columns: str | None = None, *, drop_noise: bool = False) -> None:
@@ -53,11 +44,7 @@ class LasStream(CloudStream):
 
 
 def read_las(path: Path, columns: str | None = None, *, drop_noise: bool = False) -> PointCloud:
-    """Read points, and colours and normals where the file has them; see `LasStream`.
-
-    Raises:
-        InputError: laspy is not installed, or it cannot read the file.
-    """
+    """The points, and colours and normals where the file has them; see `LasStream`."""
     laspy, choice = _laspy(path, columns), _Choice(path, drop_noise)
     with _reading(path):
         las = laspy.read(path)
@@ -78,7 +65,7 @@ class _Choice:
         self.colored = False
 
     def look(self, part: Any) -> None:
-        """Count what is left out, and see whether there are colours: without any, writers fill the columns with 0."""
+        """Count what is left out, and check for colours: without any, writers fill the columns with 0."""
         self.names = ["x", "y", "z", *(name for name in part.point_format.dimension_names if name not in "XYZ")]
         self.points += len(part)
         self.withheld += int(np.count_nonzero(part.withheld))
@@ -93,13 +80,9 @@ class _Choice:
         if self.drop_noise:
             kept &= ~self._is_noise(part)
         layout = self._layout()
-
-        def pick(which: Triple) -> NDArray[Any]:
-            values = np.stack([np.asarray(part[self.names[k]]) for k in which], axis=1)
-            return values if kept.all() else values[kept]
-
-        normals, colors = layout.normals and pick(layout.normals), layout.colors and pick(layout.colors)
-        return RawRows(pick(layout.points), normals, colors)
+        used = {k for which in layout[:3] if which is not None for k in which}
+        columns = [np.asarray(part[name])[kept] if k in used else np.empty(0) for k, name in enumerate(self.names)]
+        return Table(self.path, columns).rows(layout)
 
     def reading(self) -> str:
         """See `PointCloud`."""
@@ -119,7 +102,7 @@ class _Choice:
 
 
 def _check_sizes(path: Path) -> None:
-    """Refuse a header that claims more than the file can hold; laspy believes it, and loops or allocates for it."""
+    """Refuse a header that claims more than the file can hold: laspy would loop or allocate for it."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(375)
@@ -151,9 +134,9 @@ def _check_sizes(path: Path) -> None:
 
 
 def _check_laz(path: Path, start: int, points: int) -> None:
-    """Refuse LAZ on which the decompressor would abort or loop: old compressors, and chunk tables that cannot be.
+    """Refuse LAZ on which the decompressor would abort or loop: old compressors, and impossible chunk tables.
 
-    Layout: the LASzip record (LASzip, "laszip.hpp") among the variable-length records; then at ``start`` the place of
+    Layout (LASzip, "laszip.hpp"): the LASzip record is one of the variable-length records. At ``start`` is the place of
     the chunk table, whose second number is the count of chunks.
     """
     with path.open("rb") as file:
@@ -194,7 +177,7 @@ def _at(head: bytes, field: tuple[struct.Struct, int]) -> tuple[int, ...]:
 
 
 def _laspy(path: Path, columns: str | None) -> Any:
-    """The library, once the file is known to be one that it can read without harm."""
+    """The library, after a check that it can read the file without harm."""
     if columns is not None:
         raise InputError(f"{path}: --columns is for tables without names; LAS files name their columns")
     try:

@@ -1,7 +1,6 @@
 """Meshes as oriented clouds: the vertices of OBJ, STL and OFF files, and area-weighted normals of their faces.
 
-OBJ is read here and not with trimesh, which splits vertices at creases and seams and loses the normals of files
-without faces.
+trimesh splits the vertices of OBJ files at creases and seams, and loses the normals of files without faces.
 """
 
 from __future__ import annotations
@@ -18,29 +17,12 @@ from ..point_cloud import PointCloud, colors_from, unit_rows
 from .columns import Table, choose_layout, cloud_from
 from .tables import numbers
 
-__all__ = [
-    "ObjText",
-    "as_mesh",
-    "read_obj",
-    "read_off",
-    "read_stl",
-    "spread_on_faces",
-    "strips",
-    "triangulate",
-    "vertex_normals",
-    "weld",
-]
-
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 
 def read_stl(path: Path) -> tuple[PointCloud, Int64]:
-    """Read the triangles of an STL file, text of any number of solids or binary; equal corners become one vertex.
-
-    Raises:
-        InputError: it is not STL or holds no triangle.
-    """
+    """The triangles of an STL file, text of any number of solids or binary; equal corners become one vertex."""
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
     if len(data) >= 84 and len(data) == 84 + 50 * count:
@@ -59,11 +41,7 @@ def read_stl(path: Path) -> tuple[PointCloud, Int64]:
 
 
 def read_off(path: Path) -> tuple[PointCloud, Int64]:
-    """Read an OFF file, with or without faces; NOFF has normals and COFF colours at its vertices.
-
-    Raises:
-        InputError: it is not OFF.
-    """
+    """An OFF file, with or without faces; NOFF has normals and COFF colours at its vertices."""
     text = re.sub(r"#[^\r\n]*", "", path.read_bytes().decode("utf-8", "replace"))
     head = re.match(r"\s*(ST)?(C)?(N)?OFF\b", text)
     lines = [line for line in text[head.end() if head else 0 :].splitlines() if line.strip()]
@@ -99,11 +77,7 @@ def _vertices(path: Path, points: Float64, colors: NDArray[np.float32] | None = 
 
 
 def as_mesh(cloud: PointCloud, faces: Int64) -> PointCloud:
-    """The vertices of a mesh; where they have no normals, with those of its triangles ``(F, 3)``.
-
-    Raises:
-        InputError: a face names a vertex that is not there.
-    """
+    """The vertices of a mesh; where they have no normals, with those of its triangles ``(F, 3)``."""
     if len(faces) and (faces.min() < 0 or faces.max() >= len(cloud)):
         raise InputError(f"{cloud.source}: face: names a vertex beyond the {len(cloud)} there are; export it again")
     if cloud.normals is not None or not len(faces):
@@ -114,11 +88,9 @@ def as_mesh(cloud: PointCloud, faces: Int64) -> PointCloud:
 
 
 def weld(vertices: Float64) -> tuple[Int64, Int64]:
-    """Find equal rows of ``vertices`` ``(N, K)``; minus zero is zero.
+    """The first of each set of equal rows of ``vertices`` ``(N, K)``: indices ``(M,)``, rows in ascending order.
 
-    Returns:
-        The index of the first of each ``(M,)``, rows in ascending order, and for each old row its place among them
-        ``(N,)``.
+    The second result is the place of each old row among them ``(N,)``.
     """
     order = np.lexsort((vertices + 0.0).T)  # stable: among equals the first comes first; + 0.0: minus zero is zero
     ordered = vertices[order]
@@ -130,15 +102,9 @@ def weld(vertices: Float64) -> tuple[Int64, Int64]:
 
 
 def spread_on_faces(areas: Float64, count: int, rng: np.random.Generator) -> tuple[Int64, Float64]:
-    """Places uniform by area: their faces ``(N,)``, in increasing order, and weights ``(N, 3)`` of the faces' corners.
+    """Places uniform by area: their faces ``(count,)``, ascending, and weights ``(count, 3)`` of the faces' corners.
 
-    Args:
-        areas: ``(F,)`` of the faces, or numbers in proportion to them.
-        count: N.
-        rng: draws them.
-
-    Raises:
-        ValueError: there is no area.
+    ``areas`` are ``(F,)`` of the faces, or numbers in proportion to them.
     """
     total = np.cumsum(areas)
     if not total[-1] > 0:
@@ -150,11 +116,9 @@ def spread_on_faces(areas: Float64, count: int, rng: np.random.Generator) -> tup
 
 
 def triangulate(lengths: Int64, corners: Int64) -> Int64:
-    """Cut polygons into fans of triangles ``(F, 3)``.
+    """Cut polygons of ``lengths`` ``(P,)`` corners into fans of triangles ``(F, 3)``; ``corners`` are of all polygons.
 
-    Args:
-        lengths: ``(P,)`` number of corners of each polygon; those with fewer than three give nothing.
-        corners: ``(sum(lengths),)`` vertex indices, polygon after polygon.
+    Polygons with fewer than three corners give nothing.
     """
     starts = np.cumsum(lengths) - lengths
     triangles = (lengths - 2).clip(min=0)
@@ -192,20 +156,14 @@ def vertex_normals(vertices: Float64, faces: NDArray[np.integer]) -> NDArray[np.
 
 
 class ObjText:
-    """A Wavefront OBJ file: its records by keyword, its vertices, and the corners of its polygons.
+    """A Wavefront OBJ file: its records by keyword, its vertices, and the corners of its polygons."""
 
-    Attributes:
-        path: the file.
-        points: ``(N, 3)`` vertices.
-        colors: ``(N, 3)`` of them (``v x y z r g b``), or None.
-        lengths: ``(P,)`` number of corners of each polygon.
-        words: all corners, polygon after polygon, as they stand in the file (``v/vt/vn``).
-        used_at: ``(C,)`` where in the text the polygon of each corner starts.
-        corners: ``(C,)`` the vertex of each.
-
-    Raises:
-        InputError: there is no vertex, something in it is not a number, or an index names no record.
-    """
+    points: Float64  # (N, 3) vertices
+    colors: NDArray[np.float32] | None  # (N, 3) of them (``v x y z r g b``)
+    lengths: Int64  # (P,) number of corners of each polygon
+    words: str  # all corners, polygon after polygon, as they stand in the file (``v/vt/vn``)
+    used_at: Int64  # (C,) where in the text the polygon of each corner starts
+    corners: Int64  # (C,) the vertex of each corner
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -228,23 +186,19 @@ class ObjText:
         self.corners = self.indices(re.sub(r"/\S*", "", self.words), starts, self.used_at, "v")
 
     def records(self, keyword: str) -> tuple[list[str], Int64]:
-        """All lines that start with ``keyword``, without it, and where in the text each one starts."""
+        """All lines that start with ``keyword``, without it, and their places in the text."""
         found = list(re.finditer(rf"^[ \t]*{keyword}[ \t]+([^#\n]*)", self._text, re.MULTILINE))
         return [match[1].strip() for match in found], np.array([match.start() for match in found], np.int64)
 
     def table(self, keyword: str, what: str) -> tuple[Float64, Int64]:
-        """The numbers of all records of ``keyword`` ``(R, K)``, and where each one starts; ``what`` they are."""
+        """The numbers of all records of ``keyword`` ``(R, K)``, and their places; messages call them ``what``."""
         listed, starts = self.records(keyword)
         return numbers("\n".join(listed), self.path, first_line=1, what=what) if listed else np.empty((0, 3)), starts
 
     def indices(self, words: str, record_starts: Int64, used_at: Int64, what: str) -> Int64:
         """OBJ indices → counted from 0; a negative one counts back from the last record before its use.
 
-        Args:
-            words: the indices.
-            record_starts: ``(R,)`` where the records that they name start.
-            used_at: ``(C,)`` where each of them is used.
-            what: keyword of those records, for messages.
+        The records of the keyword ``what`` start at ``record_starts`` ``(R,)``, the polygons at ``used_at`` ``(C,)``.
         """
         try:
             index = np.array(words.split(), np.int64)
@@ -272,11 +226,7 @@ def _vertex_table(listed: list[str], path: Path) -> Float64:
 
 
 def read_obj(path: Path) -> tuple[PointCloud, Int64]:
-    """Read an OBJ file; a vertex that its faces give several normals gets their sum.
-
-    Raises:
-        InputError: there is no vertex, or something in it is not a number.
-    """
+    """An OBJ file; a vertex that its faces give several normals gets their sum."""
     obj = ObjText(path)
     corners, faces = obj.corners, triangulate(obj.lengths, obj.corners)
     cloud = _vertices(path, obj.points, obj.colors)

@@ -1,7 +1,6 @@
 """PCD, the point clouds of PCL, ROS and Open3D: text, binary, and compressed.
 
-Format: "The PCD (Point Cloud Data) file format", pointclouds.org. Compressed bodies hold each field by itself, in
-LZF's two kinds of items: up to 32 literal bytes, or 3 to 264 bytes copied from up to 8 KiB before.
+Format: "The PCD (Point Cloud Data) file format", pointclouds.org. Compressed bodies hold one field after the other.
 """
 
 from __future__ import annotations
@@ -19,17 +18,11 @@ from ..point_cloud import PointCloud
 from .columns import Table, choose_layout, cloud_from
 from .tables import numbers
 
-__all__ = ["read_pcd"]
-
 Form = tuple[np.dtype[Any], int]  # of a field: type, and how many numbers
 
 
 def read_pcd(path: Path, columns: str | None = None) -> PointCloud:
-    """Read a PCD file; colours that are packed into one field ``rgb`` or ``rgba`` are unpacked.
-
-    Raises:
-        InputError: the header is not PCD's, or the file ends too early.
-    """
+    """The points of a PCD file; colours that are packed into one field ``rgb`` or ``rgba`` are unpacked."""
     data = path.read_bytes()
     end = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data[: 1 << 20], re.MULTILINE | re.IGNORECASE)
     if end is None:
@@ -89,7 +82,7 @@ def _fields(body: bytes, kind: str, forms: list[Form], points: int, path: Path) 
 
 
 def _unpacked(packed: bytes, path: Path) -> bytes:
-    """What LZF has packed."""
+    """Unpack LZF: items of 1 to 32 literal bytes, or of 3 to 264 bytes that are copied from at most 8 KiB before."""
     out, at, end = bytearray(), 0, len(packed)
     while at < end:
         control = packed[at]

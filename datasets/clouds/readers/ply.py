@@ -1,7 +1,6 @@
-"""PLY point clouds, exactly: any vertex type and order, lists, elements before and after the vertices.
+"""PLY: any vertex type and order, lists, elements before and after the vertices.
 
-Format: G. Turk, "The PLY Polygon File Format", 1994. An ASCII body is turned into the binary body of a
-file whose properties are all doubles, so that one decoder serves all three encodings.
+Format: G. Turk, "The PLY Polygon File Format", 1994. An ASCII body is decoded as a binary one of doubles.
 """
 
 from __future__ import annotations
@@ -19,11 +18,8 @@ from numpy.typing import NDArray
 from ....neural_fields import InputError
 from ....neural_fields.backend.files import write_whole
 from ..point_cloud import PointCloud
-from .columns import Table, choose_layout, cloud_from, describe_layout
+from .columns import Table, TableStream, choose_layout, cloud_from
 from .meshes import as_mesh, strips, triangulate
-from .stream import TableStream
-
-__all__ = ["ply_stream", "read_ply", "read_ply_mesh", "write_cloud_ply"]
 
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -54,35 +50,27 @@ class _Element:
 
 @dataclass(frozen=True)
 class _Lists:
-    """One list per row: ``lengths`` ``(n,)`` and all items in one array."""
+    """One list per row."""
 
-    lengths: NDArray[np.int64]
-    items: NDArray[Any]
+    lengths: NDArray[np.int64]  # (n,)
+    items: NDArray[Any]  # of all lists
 
 
 _Columns = dict[str, "NDArray[Any] | _Lists"]
 
 
 def read_ply(path: Path, columns: str | None = None) -> PointCloud:
-    """Read the vertices of a PLY file; if they have no normals but the file has faces, take those of the mesh.
-
-    Raises:
-        InputError: the header is not PLY, x, y or z is missing, or the file ends too early.
-    """
+    """The vertices of a PLY file; if they have no normals but the file has faces, with those of the mesh."""
     return _read(path, columns, meshes=False)[0]
 
 
 def read_ply_mesh(path: Path) -> tuple[PointCloud, NDArray[np.int64]]:
-    """Read the vertices and the triangles ``(F, 3)`` of a PLY file; of polygons, fans. There may be none.
-
-    Raises:
-        InputError: see `read_ply`.
-    """
+    """The vertices and the triangles ``(F, 3)`` of a PLY file; of polygons, fans. There may be none."""
     return _read(path, None, meshes=True)
 
 
 def _read(path: Path, columns: str | None, *, meshes: bool) -> tuple[PointCloud, NDArray[np.int64]]:
-    """Vertices and faces; unless ``meshes`` are asked for, no faces where the vertices have normals of their own."""
+    """Vertices and faces; without ``meshes``, no faces where the vertices have normals of their own."""
     data = path.read_bytes()
     encoding, elements, body = _parse_header(data, path)
     order = _ORDERS[encoding]
@@ -94,7 +82,9 @@ def _read(path: Path, columns: str | None, *, meshes: bool) -> tuple[PointCloud,
         stored = _as_doubles(element) if encoding == "ascii" else element
         found, body = _decode(data, body, stored, order, path)
         if element.name == "vertex":
-            cloud = _cloud({p.name: _restore(found[p.name], p) for p in element.properties}, columns, path)
+            scalars = {p.name: _restore(found[p.name], p) for p in element.properties if p.length_kind is None}
+            table = Table(path, list(scalars.values()), list(scalars), "vertex: ")
+            cloud = cloud_from(table, choose_layout(table, columns))
             if not meshes and cloud.normals is not None:
                 break  # nothing that follows is needed
         elif element.name in ("face", "tristrips"):
@@ -102,13 +92,7 @@ def _read(path: Path, columns: str | None, *, meshes: bool) -> tuple[PointCloud,
     if cloud is None:
         raise InputError(f"{path}: vertex: the header declares no such element; export it as a point cloud")
     triangles = np.concatenate(faces)
-    return as_mesh(cloud, triangles), triangles
-
-
-def _cloud(vertex: _Columns, columns: str | None, path: Path) -> PointCloud:
-    scalars = {name: column for name, column in vertex.items() if isinstance(column, np.ndarray)}
-    table = Table(path, list(scalars.values()), list(scalars), "vertex: ")
-    return cloud_from(table, choose_layout(table, columns))
+    return as_mesh(cloud, triangles) if len(triangles) else cloud, triangles
 
 
 def _faces(
@@ -124,13 +108,9 @@ def _faces(
 
 
 def ply_stream(path: Path, columns: str | None = None) -> TableStream | None:
-    """The vertices of a PLY file, to be read in pieces; None if that cannot be: only `read_ply` reads such a file.
+    """The vertices of a PLY file in pieces; None if only `read_ply` can read it.
 
-    The file must be binary, its vertices must come first and hold no lists, and their normals must stand with them if
-    there are faces.
-
-    Raises:
-        InputError: the header is not PLY, or the file ends too early.
+    The file must be binary. Its vertices must come first, hold no lists, and have normals if there are faces.
     """
     with path.open("rb") as file:
         head = file.read(1 << 20)  # longer headers are left to `read_ply`
@@ -148,8 +128,7 @@ def ply_stream(path: Path, columns: str | None = None) -> TableStream | None:
     layout = choose_layout(table, columns)
     if layout.normals is None and any(element.name in ("face", "tristrips") for element in elements):
         return None
-    reading = describe_layout(table, layout, vertex.count)
-    return TableStream(path, offset=body, row=row, count=vertex.count, layout=layout, reading=reading)
+    return TableStream(table, offset=body, row=row, count=vertex.count, layout=layout)
 
 
 def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
@@ -232,10 +211,9 @@ def _as_doubles(element: _Element) -> _Element:
     return _Element(element.name, element.count, tuple(doubles))
 
 
-def _restore(column: NDArray[Any] | _Lists, declared: _Property) -> NDArray[Any] | _Lists:
+def _restore(column: NDArray[Any] | _Lists, declared: _Property) -> NDArray[Any]:
     """Give a scalar column its declared type back (an ASCII body was read as doubles)."""
-    if isinstance(column, _Lists):
-        return column
+    assert isinstance(column, np.ndarray)
     # A double written into an ascii "float" property keeps its digits: people do write map coordinates so.
     return column if declared.kind[0] == "f" else column.astype(declared.kind)
 
@@ -263,11 +241,7 @@ def _cut_off(path: Path, element: _Element) -> InputError:
 
 
 def _list_length(data: bytes, at: int, kind: str, item: str) -> int:
-    """The length of the list that begins at ``at``.
-
-    Raises:
-        ValueError: it is none, or longer than what is left of the file.
-    """
+    """The length of the list that begins at ``at``; a ValueError if what is left of the file cannot hold it."""
     length = float(np.frombuffer(data, kind, 1, at)[0])
     left = len(data) - at - np.dtype(kind).itemsize
     if not (length.is_integer() and 0 <= length <= left // np.dtype(item).itemsize):

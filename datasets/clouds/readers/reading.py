@@ -1,4 +1,4 @@
-"""``read_cloud``: any supported file → ``PointCloud``."""
+"""``read_cloud``: a point cloud or mesh from a file of any known format."""
 
 from __future__ import annotations
 
@@ -13,24 +13,13 @@ from numpy.typing import NDArray
 from ....neural_fields import InputError
 from ...files import readable
 from ..point_cloud import PointCloud, usable_rows
+from .columns import CloudStream
 from .e57 import read_e57
 from .las import LasStream, read_las
 from .meshes import read_obj, read_off, read_stl
 from .pcd import read_pcd
 from .ply import ply_stream, read_ply, read_ply_mesh
-from .stream import CloudStream
 from .tables import npy_stream, read_npy, read_npz, read_text
-
-__all__ = [
-    "CLOUD_SUFFIXES",
-    "MESH_READERS",
-    "MIN_POINTS",
-    "check_cloud",
-    "check_cloud_path",
-    "open_stream",
-    "read_cloud",
-    "read_mesh",
-]
 
 MIN_POINTS = 10
 """Fewer points than this are no surface."""
@@ -63,13 +52,7 @@ def read_cloud(path: str | Path, *, columns: str | None = None, drop_noise: bool
         drop_noise: whether LAS points of the classes for noise are left out.
 
     Raises:
-        InputError: the file is missing, damaged, foreign or of an unknown kind, or holds no usable cloud.
-
-    Example:
-        >>> read_cloud("scan.xyzz")
-        Traceback (most recent call last):
-        ...
-        mplicits.neural_fields.backend.errors.InputError: scan.xyzz: no such file; check the path
+        InputError: the file cannot be read, or holds no usable cloud.
     """
     path = check_cloud_path(path)
     suffix = path.suffix.lower()
@@ -87,22 +70,14 @@ def read_cloud(path: str | Path, *, columns: str | None = None, drop_noise: bool
 
 
 def read_mesh(path: str | Path) -> tuple[PointCloud, NDArray[np.int64]]:
-    """The vertices and the triangles ``(F, 3)``, of which there may be none, of a PLY, OBJ, STL or OFF file.
-
-    Raises:
-        InputError: see `read_cloud`.
-    """
+    """The vertices and the triangles ``(F, 3)``, of which there may be none, of a PLY, OBJ, STL or OFF file."""
     path = check_cloud_path(path)
     with readable(path):
         return MESH_READERS[path.suffix.lower()](path)
 
 
 def check_cloud_path(path: str | Path) -> Path:
-    """The path of a file that is there, is not empty and has an extension that is known.
-
-    Raises:
-        InputError: it is not.
-    """
+    """The path, if it names a file that exists, is not empty and has a known extension; else an InputError."""
     path = Path(path)
     with readable(path):
         if path.is_dir():
@@ -122,11 +97,7 @@ def check_cloud_path(path: str | Path) -> Path:
 
 
 def open_stream(path: str | Path, *, columns: str | None = None, drop_noise: bool = False) -> CloudStream | None:
-    """A file to be read in pieces: binary PLY, NPY, LAS and LAZ; None for all that only `read_cloud` reads.
-
-    Raises:
-        InputError: the file is missing, damaged or of an unknown kind.
-    """
+    """A binary PLY, NPY, LAS or LAZ file in pieces; None for what only `read_cloud` reads."""
     path = check_cloud_path(path)
     suffix = path.suffix.lower()
     with readable(path):
@@ -136,21 +107,15 @@ def open_stream(path: str | Path, *, columns: str | None = None, drop_noise: boo
 
 
 def check_cloud(cloud: PointCloud) -> None:
-    """Refuse a cloud that is no surface.
-
-    Raises:
-        InputError: too few finite points, or all at one place.
-    """
+    """Refuse a cloud with too few finite points, or with all of them at one place, by an InputError."""
     finite = cloud.points[usable_rows(cloud.points)]
     if len(finite) == 0:
         raise InputError(f"{cloud.source}: points: none with finite coordinates among {len(cloud)}; export it again")
     if bool((finite == finite[0]).all()) and len(finite) > 1:
         raise InputError(f"{cloud.source}: points: all {len(finite)} coincide; export it with more digits")
-    if (
-        len(finite) > 1 and (extent := float(np.ptp(finite, axis=0).max())) < 1e-100
-    ):  # squares of distances within vanish
+    extent = float(np.ptp(finite, axis=0).max())
+    if len(finite) > 1 and extent < 1e-100:  # squares of distances would vanish
         raise InputError(f"{cloud.source}: points: {extent:.3g} across; export it in a smaller unit")
     if len(finite) < MIN_POINTS:
-        raise InputError(
-            f"{cloud.source}: points: {len(finite)} with finite coordinates; at least {MIN_POINTS} are needed"
-        )
+        count = f"{len(finite)} with finite coordinates"
+        raise InputError(f"{cloud.source}: points: {count}; at least {MIN_POINTS} are needed")

@@ -13,22 +13,15 @@ from numpy.typing import NDArray
 from ....neural_fields import InputError
 from ...files import DAMAGED_ARRAYS, numeric, read_arrays
 from ..point_cloud import PointCloud
-from .columns import Table, choose_layout, cloud_from, describe_layout, named_layout, sampled
-from .stream import TableStream
-
-__all__ = ["is_number", "npy_stream", "numbers", "read_npy", "read_npz", "read_text"]
+from .columns import Table, TableStream, choose_layout, cloud_from, named_layout, sampled
 
 _MARKS = re.compile(r"^\s*(//|[#;%!])[#;%!/\s]*")  # before a comment
 
 
 def read_text(path: Path, columns: str | None = None) -> PointCloud:
-    """Read a text table; columns are separated by commas, semicolons, tabs or spaces.
+    """A text table; columns are separated by commas, semicolons, tabs or spaces.
 
-    A line before the numbers may name the columns, as a comment or not; see `choose_layout` for what names mean, and
-    for tables without names. A lone count, as PTS has it, is skipped; of several scans in a PTS file, each of them.
-
-    Raises:
-        InputError: it is not text, a word is not a number, or the columns cannot be told.
+    A line before the numbers may name the columns (see `choose_layout`). The counts of points in PTS files are skipped.
     """
     data = path.read_bytes()
     wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -47,12 +40,7 @@ def read_text(path: Path, columns: str | None = None) -> PointCloud:
             break
     first = _strip(lines[skipped])
     if not first:
-        what = (
-            "only comments and blank lines"
-            if not any(not _MARKS.match(x) and x.strip() for x in lines)
-            else "no numbers"
-        )
-        raise InputError(f"{path}: {what} in it; export it again")
+        raise InputError(f"{path}: no numbers in it; export it again")
     separator, decimal = _dialect(first)
     body = "\n".join(lines[skipped:])
     if count:
@@ -93,11 +81,7 @@ def _names(line: str, separator: str | None, width: int) -> list[str] | None:
 
 
 def numbers(body: str, path: Path, *, first_line: int, what: str) -> NDArray[np.float64]:
-    """Parse a table of white-space separated numbers → ``(N, columns)``.
-
-    Raises:
-        InputError: a word is not a number, or a line has another number of columns; names the line.
-    """
+    """Parse a table of white-space separated numbers → ``(N, columns)``; an InputError names the line."""
     if not re.search(r"^[ \t]*[^#\s]", body, re.MULTILINE):
         raise InputError(f"{path}: no numbers in it; export it again")
     try:
@@ -135,11 +119,7 @@ def is_number(word: str) -> bool:
 
 
 def read_npy(path: Path, columns: str | None = None) -> PointCloud:
-    """Read one array ``(N, C)``, or a structured one with names; see `choose_layout`.
-
-    Raises:
-        InputError: it is not a NumPy array of numbers, or the columns cannot be told.
-    """
+    """One array ``(N, C)``, or a structured one with names; see `choose_layout`."""
     array = read_arrays(path)
     if not isinstance(array, np.ndarray):
         raise InputError(f"{path}: an NPZ archive under another name; rename it to .npz")
@@ -159,11 +139,7 @@ def _array_table(path: Path, array: NDArray[Any]) -> Table:
 
 
 def npy_stream(path: Path, columns: str | None = None) -> TableStream | None:
-    """The rows of an array, to be read in pieces; None if that cannot be: only `read_npy` reads such a file.
-
-    Raises:
-        InputError: see `read_npy`.
-    """
+    """The rows of an array in pieces; None if only `read_npy` can read it."""
     try:
         array = np.lib.format.open_memmap(path, mode="r")
     except DAMAGED_ARRAYS:
@@ -173,8 +149,7 @@ def npy_stream(path: Path, columns: str | None = None) -> TableStream | None:
     table = _array_table(path, np.array(sampled(array)))
     layout = choose_layout(table, columns)
     row = np.dtype((array.dtype, array.shape[1:]))
-    reading = describe_layout(table, layout, len(array))
-    return TableStream(path, offset=array.offset, row=row, count=len(array), layout=layout, reading=reading)
+    return TableStream(table, offset=array.offset, row=row, count=len(array), layout=layout)
 
 
 # Names of arrays, without case and underscores, and the columns that they hold.
@@ -186,12 +161,9 @@ _ARRAYS = {
 
 
 def read_npz(path: Path, columns: str | None = None) -> PointCloud:
-    """Read ``points`` (N, 3), ``normals`` (float, or int8/int16 over their largest value) and ``colors``.
+    """``points`` (N, 3), ``normals`` (float, or int8/int16 over their largest value) and ``colors``.
 
     Other usual names (``xyz``, ``rgb``), and arrays for single columns (``x``, ``nx``, ``red``), are known too.
-
-    Raises:
-        InputError: it is not such an archive, or an array has the wrong type or shape.
     """
 
     def known(name: str) -> tuple[str, ...] | None:

@@ -1,7 +1,6 @@
-"""COLMAP's sparse models, text and binary: cameras, poses and points.
+"""COLMAP's sparse models, text and binary, by its documentation ("Output Format").
 
-The records are those of COLMAP's documentation ("Output Format"). World to camera is ``R(q) x + t``; the axes are
-OpenCV's; pixels count from the image's corner, so half a pixel is taken off.
+World to camera is ``R(q) x + t`` in OpenCV's axes. Pixels count from the image's corner: half a pixel is taken off.
 """
 
 from __future__ import annotations
@@ -21,8 +20,6 @@ from ....neural_fields import InputError
 from ....neural_fields.backend.files import natural
 from ...cameras import Camera, intrinsics
 from .shots import IMAGE_SUFFIXES, Shot
-
-__all__ = ["find_model", "find_models", "read_colmap", "read_colmap_points"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -81,7 +78,7 @@ def find_models(folder: Path) -> list[Path]:
 
 
 def _count_images(model: Path) -> int:
-    """How many photographs a model places; 0 where it is damaged, which its reader will say."""
+    """The number of photographs of a model; 0 where it is damaged, which its reader will report."""
     images = _part(model, "images")
     with suppress(InputError):
         return int(_Records(images).take("Q")[0]) if images.suffix == ".bin" else len(_text_poses(images))
@@ -89,13 +86,10 @@ def _count_images(model: Path) -> int:
 
 
 def read_colmap(model: Path) -> list[Shot]:
-    """Read the cameras of a model, in the order of the images' names.
+    """The cameras of a model, in the order of the images' names.
 
     Photographs are in ``images`` beside the model, or one or two folders above it. Their masks are in ``masks``, with
     COLMAP's own names (``a.jpg.png``) or those of the photographs with any extension.
-
-    Raises:
-        InputError: a file of the model is missing or damaged, or a camera has a lens that is no pinhole.
     """
     cameras, images = _part(model, "cameras"), _part(model, "images")
     lenses = _binary_lenses(cameras) if cameras.suffix == ".bin" else _text_lenses(cameras)
@@ -117,14 +111,9 @@ def read_colmap(model: Path) -> list[Shot]:
 
 
 def read_colmap_points(model: Path) -> tuple[Float64, Int64] | None:
-    """The sparse points of a model, and which images they were seen in; None where it has none.
+    """The sparse points ``(P, 3)`` of a model, and ``(K, 2)`` numbers of an image and of a point that it shows.
 
-    Returns:
-        Points ``(P, 3)`` in world coordinates; and of each time that an image saw one the number of the image, in the
-        order of `read_colmap`, and that of the point ``(K, 2)``.
-
-    Raises:
-        InputError: the file is damaged.
+    Images are numbered in the order of `read_colmap`. None if the model has no points.
     """
     binary, text = model / "points3D.bin", model / "points3D.txt"
     if not binary.is_file() and not text.is_file():
@@ -150,7 +139,7 @@ def _part(model: Path, kind: str) -> Path:
 
 
 def _poses(images: Path) -> list[_Pose]:
-    """Of the images, in the order of their names."""
+    """The poses of the images, in the order of their names."""
     poses = _binary_poses(images) if images.suffix == ".bin" else _text_poses(images)
     if not poses:
         raise InputError(f"{images}: no images; expected at least one that COLMAP registered")
@@ -170,7 +159,7 @@ def _mask(folder: Path, name: str) -> Path:
 
 
 def _camera(lens: _Lens, pose: _Pose, named_lens: str, named: str) -> Camera:
-    """A camera with its lens: COLMAP's models have the coefficients of OpenCV, in its order."""
+    """A camera with its lens: COLMAP's coefficients are those of OpenCV, in its order."""
     if lens.model not in PINHOLES:
         raise InputError(f"{named_lens}: {lens.model}: no pinhole; run colmap image_undistorter and use its output")
     if len(lens.numbers) != MODELS[lens.model]:
@@ -239,7 +228,7 @@ def _text_points(path: Path) -> tuple[Float64, Int64]:
 
 
 def _observations(images: Int64, tracks: Sequence[Sized]) -> Int64:
-    """``(K, 2)``: images that saw a point, one point after the other, and the numbers of the points."""
+    """``(K, 2)`` numbers of an image and of a point that it shows, one point after the other."""
     return np.column_stack((images, np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])))
 
 

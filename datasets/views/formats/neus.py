@@ -17,20 +17,14 @@ from ...cameras import Camera, intrinsics
 from ...files import read_arrays
 from .shots import Shot, image_size, list_images
 
-__all__ = ["read_neus", "read_neus_sphere"]
-
 IMAGE_FOLDERS = ("image", "images", "rgb")  # beside the file; NeuS has the first
 MASK_FOLDERS = ("mask", "masks")
-MAX_SKEW = 0.5  # pixels that skew may move a point at the image's edge, before we say that we cannot draw it
+MAX_SKEW = 0.5  # pixels that skew may move a point at the image's edge, before the camera is refused
 SAME_SPHERE = 1e-5  # how far two spheres, or the axes of one, may be apart, as a share of their radius
 
 
 def read_neus(path: Path) -> list[Shot]:
-    """Read the projections ``world_mat_i``; the i-th image and mask in name order beside the file go with them.
-
-    Raises:
-        InputError: the file is damaged, a projection in it cannot be one, or images or masks are missing.
-    """
+    """The projections ``world_mat_i``, with the i-th image and mask in name order beside the file."""
     matrices = _arrays(path, "world_mat")
     if not matrices:
         raise InputError(f"{path}: world_mat_0: no such array; is it a cameras_sphere.npz?")
@@ -55,11 +49,7 @@ def read_neus(path: Path) -> list[Shot]:
 
 
 def read_neus_sphere(path: Path) -> Similarity | None:
-    """The sphere that ``scale_mat_i`` makes of the unit sphere, ``x_world = scale · x_unit + center``, if any is there.
-
-    Raises:
-        InputError: the file is damaged, or the matrices are no scale and shift, or not the same for all views.
-    """
+    """The region of the object: ``scale_mat_i`` is ``x_world = scale · x_unit + center``; None without such arrays."""
     matrices = _arrays(path, "scale_mat")
     if not matrices:
         return None
@@ -79,7 +69,7 @@ def read_neus_sphere(path: Path) -> Similarity | None:
 
 
 def _arrays(path: Path, kind: str) -> Mapping[str, NDArray[Any]]:
-    """The arrays ``kind_i`` of the archive; others, like the inverses that some files hold as well, are not read."""
+    """The arrays ``kind_i`` of the archive; others are not read."""
     arrays = read_arrays(path, lambda names: [name for name in names if re.fullmatch(rf"{kind}_\d+", name)])
     return arrays if isinstance(arrays, dict) else {}
 
@@ -90,7 +80,7 @@ def _files(path: Path, folders: Sequence[str]) -> list[Path]:
 
 
 def _camera(matrix: NDArray[Any], size: tuple[int, int], named: str) -> Camera:
-    """Take ``P = K R [I | −eye]``, which maps homogeneous world points to pixels, apart."""
+    """The camera of ``P = K R [I | −eye]``, which maps homogeneous world points to pixels."""
     if matrix.shape not in ((4, 4), (3, 4)) or matrix.dtype.kind not in "fiu":
         raise InputError(f"{named}: {matrix.dtype} of shape {matrix.shape}; expected numbers of shape (4, 4)")
     projection = matrix[:3].astype(np.float64)

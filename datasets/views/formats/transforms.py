@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from ....neural_fields import InputError
 from ...cameras import COEFFICIENTS, Camera, intrinsics
 from ...files import finite_number, read_json
-from .shots import Shot, find_file, find_image, image_size
-
-__all__ = ["read_transforms"]
+from .shots import IMAGE_SUFFIXES, Shot, image_size
 
 Float64 = NDArray[np.float64]
 
@@ -28,7 +26,7 @@ OBLIQUE = 1e-3  # how far the axes of a pose may be from orthogonal and of one l
 
 @dataclass(frozen=True)
 class _Frame:
-    """One frame of a transforms.json; what it does not say itself stands at the top of the file."""
+    """One frame of a transforms.json; keys that it lacks stand at the top of the file."""
 
     path: Path
     index: int
@@ -37,10 +35,8 @@ class _Frame:
 
     def named(self, key: str) -> str:
         """File and field, as the beginning of a message."""
-        return f"{self.path}: {key}" if key in self.shared and key not in self.own else self._own(key)
-
-    def _own(self, key: str) -> str:
-        return f"{self.path}: frames[{self.index}].{key}"
+        place = key if key in self.shared and key not in self.own else f"frames[{self.index}].{key}"
+        return f"{self.path}: {place}"
 
     def get(self, key: str) -> Any:
         return self.own.get(key, self.shared.get(key))
@@ -63,11 +59,7 @@ class _Frame:
 
 
 def read_transforms(path: Path) -> list[Shot]:
-    """Read a transforms.json; see `read_cameras` for what it may hold.
-
-    Raises:
-        InputError: the file is damaged, or a frame in it cannot be one.
-    """
+    """The photographs of a transforms.json; see `read_cameras` for its keys."""
     content = read_json(path)
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
@@ -85,7 +77,7 @@ def _shot(frame: _Frame) -> Shot:
     if name is None:
         raise InputError(f"{frame.named('file_path')}: None; expected the name of the image")
     folder = frame.path.parent
-    image = find_image(folder, name)
+    image = _image(folder, name)
     # nerfstudio's name of the key, and instant-ngp's, which says how much a step of an integer is.
     depth = _file_name(frame, "depth_file_path") or _file_name(frame, "depth_path")
     step = None if depth is None else frame.positive("integer_depth_scale")
@@ -93,11 +85,24 @@ def _shot(frame: _Frame) -> Shot:
         name,
         _camera(frame, image),
         image,
-        None if mask is None else find_file(folder, mask),
+        None if mask is None else _beside(folder, mask),
         f"{frame.path}: frames[{frame.index}]",
-        None if depth is None else find_file(folder, depth),
+        None if depth is None else _beside(folder, depth),
         None if step is None else 1 / step,
     )
+
+
+def _beside(folder: Path, name: str) -> Path:
+    """The file of that name; names that were written on Windows may have backslashes."""
+    beside = folder / name
+    return beside if beside.exists() or "\\" not in name else folder / name.replace("\\", "/")
+
+
+def _image(folder: Path, name: str) -> Path:
+    """The image of that name, which may be missing; Blender's scenes omit its extension."""
+    beside = _beside(folder, name)
+    files = [beside, *(beside.with_name(beside.name + suffix) for suffix in IMAGE_SUFFIXES)]
+    return next((file for file in files if file.is_file()), beside)
 
 
 def _file_name(frame: _Frame, key: str) -> str | None:

@@ -1,4 +1,4 @@
-"""COLMAP in a process of its own, with its progress; and projects that are gone on with where they were interrupted."""
+"""COLMAP in a process of its own, with its progress, and projects that continue where they were interrupted."""
 
 from __future__ import annotations
 
@@ -13,61 +13,28 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from ....neural_fields import InputError
 from ....neural_fields.backend.files import check_place
 
-__all__ = [
-    "DATABASE_FILE",
-    "FEATURES",
-    "MATCHING",
-    "OVERLAP",
-    "Job",
-    "Report",
-    "begun",
-    "check_colmap",
-    "extract_features",
-    "film_pairs",
-    "fingerprint",
-    "new_model",
-    "solve",
-    "verification_options",
-    "write_record",
-]
-
 RECORD_FILE, DATABASE_FILE, LOG_FILE = "cameras.json", "database.db", "colmap.log"
-LARGEST_SIDE = 1600  # pixels in which features are looked for
-OVERLAP = 10  # frames of a film after each that it is matched with; and the 2^n-th ones after it
+LARGEST_SIDE = 1600  # pixels; larger photographs are shrunk before features are extracted
+OVERLAP = 10  # frames of a film that each is matched with, besides the 2^n-th ones after it
 POLL_SECONDS = 0.3
 FEATURES, MATCHING = "finding features", "matching"
 
 Report = Callable[[str, int, int], None]
+"""Takes the name of a stage, how much of it is done, and of how much."""
+
+Job = Callable[[Path, Connection], dict[str, Any]]
+"""Takes a project and a connection for ``("stage", (name, photographs done))``; returns what `solve` returns."""
+
 T = TypeVar("T")
 
 
-class Job(Protocol):
-    """What COLMAP is to do."""
-
-    def __call__(self, project: Path, told: Connection, /) -> dict[str, Any]:
-        """Do it in a process of its own.
-
-        Args:
-            project: the folder.
-            told: takes ``("stage", (name, how many photographs are done))``.
-
-        Returns:
-            What was found; it travels to the first process.
-        """
-        ...
-
-
 def check_colmap() -> None:
-    """Ask, before any long work, whether the extra ``mplicits[poses]`` is installed.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Refuse to begin without the extra ``mplicits[poses]``."""
     try:
         import pycolmap  # noqa: F401
     except ImportError as error:
@@ -75,23 +42,17 @@ def check_colmap() -> None:
 
 
 def fingerprint(files: list[Path]) -> str:
-    """Of names, sizes and times of change; contents would be read for minutes."""
+    """A hash of names, sizes and times of change: to read the contents would take minutes."""
     digest = hashlib.sha256()
     for file in files:
         digest.update(f"{file.name} {file.stat().st_size} {file.stat().st_mtime_ns}\n".encode())
     return digest.hexdigest()
 
 
-def begun(project: Path, asked: dict[str, Any], form: Callable[[dict[str, Any]], T]) -> T | None:
-    """What was found in a project before; None where there is more to do. The project is then begun.
+def begun(project: Path, asked: dict[str, Any], kind: type[T]) -> T | None:
+    """The result of a finished project, a dataclass ``kind``; else None, and a new project is begun.
 
-    Args:
-        project: the folder.
-        asked: from what, and how.
-        form: makes of the record what is returned; may raise a ValueError, TypeError or KeyError.
-
-    Raises:
-        InputError: the folder is another's, or was made of something else.
+    ``asked`` are the source and the settings. An InputError says that the folder was made of others.
     """
     record_file = project / RECORD_FILE
     if project.exists() and not project.is_dir():
@@ -108,7 +69,8 @@ def begun(project: Path, asked: dict[str, Any], form: Callable[[dict[str, Any]],
         found = record.pop("found", None)
         same = record == asked
         if same and found is not None:
-            return form(found)
+            values = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
+            return kind(**{**values, "project": project})
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{record_file}: damaged ({error}); remove the folder, or name another") from error
     if not same:
@@ -120,24 +82,17 @@ def begun(project: Path, asked: dict[str, Any], form: Callable[[dict[str, Any]],
 
 
 def write_record(project: Path, record: dict[str, Any]) -> None:
-    """Say in a project what was asked, and what was found, if it was: all at once."""
+    """Write what was asked, and the result under ``found`` if there is one, in one step."""
     half = project / f".{RECORD_FILE}"
-    half.write_text(json.dumps(record, indent=1), encoding="utf-8")
+    text = json.dumps(record, indent=1, default=lambda _: "")  # the only path is that of the project, which may move
+    half.write_text(text, encoding="utf-8")
     half.replace(project / RECORD_FILE)
 
 
 def solve(project: Path, job: Job, *, photographs: int, pairs: int, report: Report) -> dict[str, Any]:
-    """Let COLMAP work in a process of its own: it can be ended at any time, and what it prints goes into a file.
+    """The result of a job that runs in a process of its own, so that Ctrl-C ends it; its output goes to a file.
 
-    Args:
-        project: the folder.
-        job: what is to be done; it can be pickled.
-        photographs: how many there are.
-        pairs: of them that are matched.
-        report: called with a stage, how much of it is done, and of how much.
-
-    Raises:
-        InputError: the job raised it, or COLMAP has ended.
+    ``pairs`` is the number of pairs of photographs that are matched. The job can be pickled.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -164,7 +119,7 @@ def solve(project: Path, job: Job, *, photographs: int, pairs: int, report: Repo
 
 
 def _progress(database: Path, stage: str, photographs: int, pairs: int, done: int) -> tuple[int, int]:
-    """How much of a stage is done: for the first two that is what the database holds."""
+    """How much of a stage is done; the first two are counted in the database."""
     if stage == FEATURES:
         return min(_rows(database, "keypoints"), photographs), photographs
     if stage == MATCHING:
@@ -173,15 +128,15 @@ def _progress(database: Path, stage: str, photographs: int, pairs: int, done: in
 
 
 def film_pairs(count: int) -> int:
-    """Frames that are matched with one another: the next ones, and those that 2, 4, 8, … come later."""
+    """Number of pairs of ``count`` frames that are 1 to 10, or 16, 32, … frames apart."""
     steps = {*range(1, OVERLAP + 1), *(2**power for power in range(OVERLAP))}
     return sum(max(count - step, 0) for step in steps)
 
 
 def _rows(database: Path, table: str) -> int:
-    """How many rows are in COLMAP's database, but for the last few megabytes that it has written.
+    """How many rows are in COLMAP's database, without the last few megabytes that it has written.
 
-    Read as immutable, no lock is taken. COLMAP does not wait for one: it would end, if it opened the file meanwhile.
+    The file is opened as immutable, without a lock: COLMAP would end if it met one.
     """
     try:
         with closing(sqlite3.connect(f"{database.resolve().as_uri()}?immutable=1", uri=True)) as opened:
@@ -191,7 +146,7 @@ def _rows(database: Path, table: str) -> int:
 
 
 def _work(project: str, job: Job, told: Connection) -> None:
-    """What the other process does."""
+    """Run a job in the other process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to both; the first one ends this one
     log = os.open(Path(project) / LOG_FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     for stream in (1, 2):
@@ -203,7 +158,7 @@ def _work(project: str, job: Job, told: Connection) -> None:
 
 
 def extract_features(project: Path, told: Connection, *, one: bool) -> None:
-    """The first stage of a job: features of all photographs, taken with ``one`` lens or one each."""
+    """The first stage of a job: features of all photographs, which share ``one`` lens or have one each."""
     import pycolmap
 
     told.send(("stage", (FEATURES, 0)))
@@ -214,7 +169,7 @@ def extract_features(project: Path, told: Connection, *, one: bool) -> None:
 
 
 def verification_options() -> Any:
-    """How matches of two photographs are held against a camera's motion: as in every other run."""
+    """Options for the geometric verification of matches, with a fixed seed."""
     import pycolmap
 
     options = pycolmap.TwoViewGeometryOptions()
@@ -224,7 +179,7 @@ def verification_options() -> Any:
 
 @contextmanager
 def new_model(project: Path) -> Iterator[Path]:
-    """A folder for a model, which becomes the project's ``sparse/0`` when the block ends without an error."""
+    """A folder that becomes the project's ``sparse/0`` when the block ends without an error."""
     half = project / ".sparse"
     shutil.rmtree(half, ignore_errors=True)
     (half / "0").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Photographs without cameras, or a film, to a COLMAP project: structure from motion by pycolmap."""
+"""Cameras of photographs or of a film: structure from motion by pycolmap."""
 
 from __future__ import annotations
 
@@ -33,31 +33,21 @@ from .colmap_process import (
     write_record,
 )
 
-__all__ = ["FILM_SUFFIXES", "PLACING", "FoundCameras", "find_cameras"]
-
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-FEWEST_PHOTOGRAPHS = 3  # photographs; two say little of a surface
-SHARPNESS_WIDTH = 480  # pixels across, in which the sharpness of frames is compared
+FEWEST_PHOTOGRAPHS = 3
+SHARPNESS_WIDTH = 480  # pixels; frames are shrunk to this width before their sharpness is compared
 PLACING = "placing cameras"
 
 
 @dataclass(frozen=True)
 class FoundCameras:
-    """What was found.
+    """The result of `find_cameras`."""
 
-    Attributes:
-        project: the folder, which `read_posed_images` reads.
-        photographs: how many there were.
-        left_out: names of those that could not be placed.
-        points: how many sparse points.
-        error: mean distance of the points' projections from where they were seen, in pixels.
-    """
-
-    project: Path
+    project: Path  # the folder, which `read_posed_images` reads
     photographs: int
-    left_out: tuple[str, ...]
-    points: int
-    error: float
+    left_out: tuple[str, ...]  # names of photographs that could not be placed
+    points: int  # number of sparse points
+    error: float  # mean reprojection error, pixels
 
 
 def find_cameras(
@@ -68,30 +58,27 @@ def find_cameras(
     lens: Literal["auto", "one", "each"] = "auto",
     report: Report | None = None,
 ) -> FoundCameras:
-    """Find where photographs were taken, and with which lens, by COLMAP's incremental structure from motion.
+    """Estimate poses and lenses of photographs by COLMAP's incremental structure from motion.
 
-    The project gets ``images`` (links to the photographs, or frames of the film) and ``sparse/0``. Features, matches
-    and what is done so far stay in it: the same call goes on where it was interrupted, and returns at once what was
-    finished. Of a film the sharpest frames are taken, one from each of ``frames`` stretches of equal length.
+    The project gets ``images`` (links to the photographs, or frames of the film) and ``sparse/0``. The same call
+    continues an interrupted project, and returns the result of a finished one at once. Of a film the sharpest frame is
+    taken from each of ``frames`` stretches of equal length.
 
     Args:
         source: a folder of photographs, or a film.
         project: the folder to be written.
-        frames: of a film.
-        lens: whether all photographs have one; auto is yes, where they have one size.
-        report: called with a stage, how much of it is done, and of how much.
+        frames: number of frames of a film.
+        lens: whether the photographs share one lens; auto: if they have one size.
+        report: progress of the stages.
 
     Raises:
-        InputError: there is nothing to be read, the project is another's, or the photographs do not hang together.
+        InputError: nothing can be read, the project is of something else, or too few photographs overlap.
     """
     source, project = Path(source), Path(project)
     check_colmap()
     photographs = _photographs(source)
     asked = {"source": str(source.resolve()), "frames": frames, "lens": lens, "content": fingerprint(photographs)}
-    found = begun(
-        project, asked, lambda was: FoundCameras(**{**was, "project": project, "left_out": tuple(was["left_out"])})
-    )
-    if found is not None:
+    if (found := begun(project, asked, FoundCameras)) is not None:
         return found
     report = report or (lambda stage, done, total: None)
     images = project / "images"
@@ -106,7 +93,7 @@ def find_cameras(
     made = solve(project, partial(_reconstructed, one=one, film=film), photographs=count, pairs=pairs, report=report)
     placed = set(made.pop("names"))
     found = FoundCameras(project, len(names), tuple(name for name in names if name not in placed), **made)
-    write_record(project, asked | {"found": asdict(found) | {"project": ""}})
+    write_record(project, asked | {"found": asdict(found)})
     return found
 
 
@@ -114,10 +101,8 @@ def _photographs(source: Path) -> list[Path]:
     if source.is_dir():
         files = list_images(source)
         if len(files) < FEWEST_PHOTOGRAPHS:
-            kinds = ", ".join(IMAGE_SUFFIXES)
-            raise InputError(
-                f"{source}: {len(files)} photographs ({kinds}) in it; {FEWEST_PHOTOGRAPHS} are the least, 30 are better"
-            )
+            count = f"{len(files)} photographs ({', '.join(IMAGE_SUFFIXES)})"
+            raise InputError(f"{source}: {count} in it; {FEWEST_PHOTOGRAPHS} are the least, 30 are better")
         return files
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; check the path")
@@ -127,14 +112,14 @@ def _photographs(source: Path) -> list[Path]:
 
 
 def _link(photographs: list[Path], images: Path) -> None:
-    """Links to the photographs; copies, where there can be no links."""
+    """Make links to the photographs, or copies where links are refused."""
     images.mkdir(exist_ok=True)
     for file in photographs:
         place = images / file.name
         if not place.exists():
             try:
                 place.symlink_to(file.resolve())
-            except OSError:  # Windows asks for a right that few have
+            except OSError:  # Windows requires a privilege
                 shutil.copyfile(file, place)
 
 
@@ -181,7 +166,7 @@ def _opened(film: Path) -> Iterator[tuple[cv2.VideoCapture, int]]:
 
 
 def _reconstructed(project: Path, told: Connection, *, one: bool, film: bool) -> dict[str, Any]:
-    """What the other process does; see `solve`."""
+    """The job of `solve`."""
     import pycolmap
 
     database, images = project / DATABASE_FILE, project / "images"
@@ -196,7 +181,7 @@ def _reconstructed(project: Path, told: Connection, *, one: bool, film: bool) ->
         pycolmap.match_exhaustive(database, verification_options=verification)
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size, options.random_seed = FEWEST_PHOTOGRAPHS, 0
-    placed = itertools.count(3)  # two are placed together, of which one is told
+    placed = itertools.count(3)  # the first two are placed together and reported once
     told.send(("stage", (PLACING, 0)))
     (project / "models").mkdir(exist_ok=True)
     models = pycolmap.incremental_mapping(

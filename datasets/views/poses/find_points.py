@@ -1,4 +1,4 @@
-"""Sparse points of photographs whose cameras are known: what several of them show, triangulated by pycolmap."""
+"""Sparse points of photographs whose cameras are known, triangulated by pycolmap."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from ....neural_fields import InputError
 from ....neural_fields.backend.files import files_in
-from ..formats.reading import find_source, read_shots
-from ..images import read_posed_images
+from ..images import find_source, read_posed_images, read_shots
 from ..writing import write_colmap
 from .colmap_process import (
     DATABASE_FILE,
@@ -31,45 +30,36 @@ from .colmap_process import (
     write_record,
 )
 
-__all__ = ["TRIANGULATING", "FoundPoints", "find_points", "neighbours"]
-
 TRIANGULATING = "triangulating"
-MATCHED_VIEWS = 20  # views that each is matched with: those that look at the region from most nearly the same side
-GIVEN, PAIRS_FILE = "given", "pairs.txt"  # what COLMAP is given: a model with cameras and no points, and who is matched
+MATCHED_VIEWS = 20  # views that each is matched with: those with the nearest directions from the region
+GIVEN, PAIRS_FILE = "given", "pairs.txt"  # input of COLMAP: a model with cameras and no points, and pairs of views
 
 
 @dataclass(frozen=True)
 class FoundPoints:
-    """What was found.
+    """The result of `find_points`."""
 
-    Attributes:
-        project: the folder, which `read_posed_images` reads.
-        photographs: how many there were.
-        points: how many sparse points.
-        error: mean distance of the points' projections from where they were seen, in pixels.
-    """
-
-    project: Path
+    project: Path  # the folder, which `read_posed_images` reads
     photographs: int
-    points: int
-    error: float
+    points: int  # number of sparse points
+    error: float  # mean reprojection error, pixels
 
 
 def find_points(source: str | Path, project: str | Path, *, report: Report | None = None) -> FoundPoints:
-    """Triangulate what several photographs show, with their cameras as they are.
+    """Triangulate sparse points from photographs with fixed cameras.
 
-    The project is a COLMAP model of the same world: photographs without lens distortion, masks as transparency, depth
-    maps, the cameras as they were given, and points with the views that saw them. Each photograph is matched with the
-    twenty that see the region from most nearly the same side. Features, matches and what is done so far stay in it:
-    the same call goes on where it was interrupted, and returns at once what was finished.
+    The project is a COLMAP model in the same world coordinates: photographs without lens distortion, masks as
+    transparency, depth maps, the given cameras, and points with their observations. Each photograph is matched with the
+    twenty whose directions from the region are nearest. The same call continues an interrupted project, and returns the
+    result of a finished one at once.
 
     Args:
         source: posed photographs, as `read_posed_images` takes them.
         project: the folder to be written.
-        report: called with a stage, how much of it is done, and of how much.
+        report: progress of the stages.
 
     Raises:
-        InputError: the photographs cannot be read, the project is another's, or no two of them show the same.
+        InputError: the photographs cannot be read, the project is of something else, or no two photographs match.
     """
     source, project = find_source(source), Path(project)
     shots = read_shots(source)
@@ -77,8 +67,7 @@ def find_points(source: str | Path, project: str | Path, *, report: Report | Non
     files = [file for shot in shots for file in (shot.image, shot.mask, shot.depth) if file is not None]
     files += [source] if source.is_file() else files_in(source, (".bin", ".txt"))
     asked = {"source": str(source.resolve()), "content": fingerprint([file for file in files if file.is_file()])}
-    found = begun(project, asked, lambda was: FoundPoints(**{**was, "project": project}))
-    if found is not None:
+    if (found := begun(project, asked, FoundPoints)) is not None:
         return found
     report = report or (lambda stage, done, total: None)
     if not (project / GIVEN).is_dir():
@@ -86,12 +75,12 @@ def find_points(source: str | Path, project: str | Path, *, report: Report | Non
     pairs = (project / PAIRS_FILE).read_text(encoding="utf-8").count("\n")
     made = solve(project, _triangulated, photographs=len(shots), pairs=pairs, report=report)
     found = FoundPoints(project, len(shots), **made)
-    write_record(project, asked | {"found": asdict(found) | {"project": ""}})
+    write_record(project, asked | {"found": asdict(found)})
     return found
 
 
 def _write_given(source: Path, project: Path) -> None:
-    """Write what COLMAP is given: photographs, cameras and pairs; the folder of the cameras appears last."""
+    """Write the input of COLMAP: photographs, cameras and pairs; the folder of the cameras appears last."""
     images = read_posed_images(source)
     half = project / ".half"
     shutil.rmtree(half, ignore_errors=True)
@@ -110,18 +99,13 @@ def _write_given(source: Path, project: Path) -> None:
 
 
 def neighbours(away: NDArray[np.float64], nearest: int = MATCHED_VIEWS) -> list[tuple[int, int]]:
-    """Pairs of views that may show the same: each with those whose directions from the region are nearest to its own.
+    """Sorted pairs of views: each with the ``nearest`` views in direction from the region, the smaller number first.
 
-    Args:
-        away: ``(V, 3)`` from the middle of the region to the eyes.
-        nearest: how many each is paired with, or more, since others may be paired with it.
-
-    Returns:
-        Pairs of numbers, the smaller one first, in order.
+    ``away`` ``(V, 3)`` is from the middle of the region to the eyes.
     """
     directions = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
     cosine = directions @ directions.T
-    np.fill_diagonal(cosine, -2)  # nobody is paired with itself
+    np.fill_diagonal(cosine, -2)  # no view is paired with itself
     order = np.argsort(-cosine, axis=1, kind="stable")[:, : min(nearest, len(away) - 1)]
     rows = np.repeat(np.arange(len(away)), order.shape[1])
     both = np.sort(np.column_stack((rows, order.reshape(-1))), axis=1)
@@ -129,7 +113,7 @@ def neighbours(away: NDArray[np.float64], nearest: int = MATCHED_VIEWS) -> list[
 
 
 def _triangulated(project: Path, told: Connection) -> dict[str, Any]:
-    """What the other process does; see `solve`."""
+    """The job of `solve`."""
     import pycolmap
 
     database, images = project / DATABASE_FILE, project / "images"
@@ -153,9 +137,9 @@ def _triangulated(project: Path, told: Connection) -> dict[str, Any]:
 
 
 def _with_numbers_of(path: Path, given: Any) -> Any:
-    """A model with the cameras and poses of another one, by the numbers that a database has for images and cameras.
+    """A model with the cameras and poses of ``given``, and the numbers that a database has for images and cameras.
 
-    The database gets its cameras: what it has guessed from the pictures is replaced.
+    The cameras that the database has guessed from the pictures are replaced.
     """
     import pycolmap
 

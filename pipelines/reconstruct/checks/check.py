@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ....datasets import read_cameras, srgb_to_linear
 from ....datasets.cameras import Camera
 from ....datasets.clouds.cleaning.orientation import fibonacci_directions
-from ....datasets.views.formats.depth_maps import DepthSource
+from ....datasets.views.formats.shots import DepthSource
 from ....datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ....neural_fields import InputError, Similarity
 from ...mesh.files import write_mesh

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ....datasets.views.formats.depth_maps import DepthMap
+from ....datasets.views.formats.shots import DepthMap
 from ....datasets.views.images import PosedImage, PosedImages
 from ..data.measured import UNITS, said_outside
 

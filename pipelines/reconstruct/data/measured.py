@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....datasets.cameras import Camera
-from ....datasets.views.formats.depth_maps import DepthMap
+from ....datasets.views.formats.shots import DepthMap
 from ....datasets.views.images import PosedImage, PosedImages
 from ....neural_fields import Field, InputError, sphere_trace
 from ....neural_fields.backend.devices import handed, uniform

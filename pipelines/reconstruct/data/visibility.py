@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ....datasets.cameras import Camera
-from ....datasets.views.pictures import shrink
+from ....datasets.views.images import shrink
 from ....neural_fields import Field, Mesh, sphere_trace
 from ...render.rasterise import mesh_view
 from ...render.studio import sees

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from mplicits.datasets import PointCloud, read_cloud, write_cloud_ply
 from mplicits.datasets.clouds.large import Merging, merge_cloud
+from mplicits.datasets.clouds.readers.columns import MemoryStream
 from mplicits.datasets.clouds.readers.reading import open_stream
-from mplicits.datasets.clouds.readers.stream import MemoryStream
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.fit.cloud import load_cloud
 from mplicits.pipelines.training.folder import MERGED_FILE

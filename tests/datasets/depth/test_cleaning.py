@@ -41,12 +41,6 @@ def test_the_weights_are_those_of_the_formula() -> None:
         assert found[row, column] == pytest.approx((weight * image).sum() / weight.sum(), rel=1e-5, abs=1e-6)
 
 
-def test_beyond_the_edges_the_image_is_mirrored() -> None:
-    image = np.arange(16, dtype=np.float32).reshape(4, 4)
-    found = joint_bilateral(np.zeros((4, 4, 1), np.float32), image, 3, 1.0, 1e6)  # means of five
-    assert found[0, 0] == pytest.approx((0 + 2 * 1 + 2 * 4) / 5)
-
-
 def test_depth_is_smoothed_without_the_contributed_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(cv2, "ximgproc", raising=False)
     rng = np.random.default_rng(0)

@@ -53,9 +53,6 @@ def degrees_between(a, b):
     return np.degrees(np.arccos((a * b).sum(axis=1).clip(-1, 1)))
 
 
-# --- one frame ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("incidence", [0, 45, 80])
 @pytest.mark.parametrize("distortion", [(0.0,) * 5, (-0.2, 0.05, 1e-3, -1e-3, 0.0)])
 def test_plane_is_met_exactly_however_steep(incidence, distortion):
@@ -226,9 +223,6 @@ def test_frames_say_what_does_not_fit():
         RgbdFrame(depth, LENS, None, 2 * np.eye(4))
 
 
-# --- poses and fusion --------------------------------------------------------------------------------
-
-
 def test_pose_is_camera_to_world():
     eye, target = np.array([5.0, 1, 2]), np.array([1.0, 2, 0.5])
     pose = pose_looking(eye, target)
@@ -332,16 +326,6 @@ def test_fusion_keeps_few_points_of_long_sequences():
     assert len(np.unique(owner)) > 10  # none rules
 
 
-def test_witnesses_are_other_frames_spread_evenly():
-    asked = depth_fusion._witnesses(9, 4)
-    assert asked.shape == (9, 4)
-    assert asked[0].tolist() == [1, 3, 6, 8]  # of 1 to 8, with steps of 7/3
-    for index, others in enumerate(asked):
-        assert index not in others
-        assert len(set(others)) == 4
-    assert depth_fusion._witnesses(3, 12).tolist() == [[1, 2], [0, 2], [0, 1]]
-
-
 def test_far_strays_give_a_hint():
     depth = np.full((72, 96), 1.0)
     depth[60:66, :10] = 7.0
@@ -377,9 +361,6 @@ def test_thinning_keeps_points_and_spreads_them():
     assert len(thin(cloud, 1)) == 1
 
 
-# --- files and the command line ----------------------------------------------------------------------
-
-
 def write_scene(folder, frames, *, scale=5000.0):
     """Frames as a user has them: folders of PNG, a trajectory and intrinsics; pictures say where pixels are."""
     (folder / "depth").mkdir()
@@ -390,10 +371,8 @@ def write_scene(folder, frames, *, scale=5000.0):
         cv2.imwrite(str(folder / "depth" / f"{index:03d}.png"), steps)
         picture = np.full((*frame.depth.shape, 3), (40 * index, 100, 200), np.uint8)
         cv2.imwrite(str(folder / "color" / f"{index:03d}.png"), picture[..., ::-1])
-        lines += [
-            f"{index} {index} {index + 1}",
-            *(" ".join(map(repr, map(float, r))) for r in frame.world_from_camera),
-        ]
+        pose = (" ".join(map(repr, map(float, row))) for row in frame.world_from_camera)
+        lines += [f"{index} {index} {index + 1}", *pose]
     (folder / "trajectory.log").write_text("\n".join(lines))
     lens = {name: getattr(LENS, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     (folder / "camera.json").write_text(json.dumps(lens | {"depth_scale": scale}))
@@ -499,26 +478,18 @@ def test_mistakes_of_the_command_line(scene, tmp_path, capsys):
     assert "3 depth maps, but no poses" in fails(capsys, scene / "depth", "--intrinsics", camera, *out)
     assert "expected a JSON file, or FX FY CX CY" in fails(capsys, depth, "--intrinsics", 1, 2, 3, *out)
     assert "--fov: does not go with --intrinsics" in fails(capsys, depth, "--intrinsics", camera, "--fov", 40, *out)
-    assert "3 poses, but 1 depth maps" in fails(
-        capsys, depth, "--intrinsics", camera, "--poses", scene / "trajectory.log", *out
-    )
+    poses = ["--poses", scene / "trajectory.log"]
+    assert "3 poses, but 1 depth maps" in fails(capsys, depth, "--intrinsics", camera, *poses, *out)
     small = tmp_path / "small.png"
     cv2.imwrite(str(small), np.zeros((36, 48, 3), np.uint8))
     assert "--resize-color" in fails(capsys, depth, "--intrinsics", camera, "--color", small, *out)
-    assert "3 pictures, but 1 depth maps" in fails(
-        capsys, small, "--intrinsics", camera, "--color", scene / "color", *out
-    )
-    assert "the intrinsics are for 96 × 72" in fails(
-        capsys, depth_of(tmp_path / "d.npy", 10, 20), "--intrinsics", camera, *out
-    )
+    pictures = ["--color", scene / "color"]
+    assert "3 pictures, but 1 depth maps" in fails(capsys, small, "--intrinsics", camera, *pictures, *out)
+    np.save(tmp_path / "d.npy", np.ones((10, 20)))
+    assert "the intrinsics are for 96 × 72" in fails(capsys, tmp_path / "d.npy", "--intrinsics", camera, *out)
     (tmp_path / "ball.xyz").write_text("0 0 0\n")
     assert "--max-depth is for depth maps" in fails(capsys, tmp_path / "ball.xyz", "--max-depth", 3, *out)
     assert not (tmp_path / "run").exists()
-
-
-def depth_of(path, height, width):
-    np.save(path, np.ones((height, width)))
-    return path
 
 
 def test_read_frame_resizes_pictures_and_takes_the_scale_of_the_camera(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from bounds import unit_roundoff
 from mplicits.datasets import ScanFaults, SimulatedScan, scan_with_truth, simulate_scan
-from mplicits.datasets.synthetic.faults import depth_jumps, kept_unevenly, quantised, rigid_motion, smeared
+from mplicits.datasets.synthetic.scanner import depth_jumps, kept_unevenly, quantised, rigid_motion, smeared
 from mplicits.neural_fields import Similarity, Sphere, Union
 from scipy.spatial.transform import Rotation
 
@@ -191,13 +191,6 @@ def test_registration_moves_whole_scans_and_their_normals():
     way = np.linalg.norm(moved.cloud.points - straight.cloud.points, axis=1) / PLACE.scale
     assert way.min() > 0
     assert way.max() < SURE * 0.01 * math.sqrt(3) * (1 + RADIUS)
-
-
-def test_quantised_scans_have_ranges_of_whole_steps():
-    found = scan(quantise=0.01)
-    lengths = np.linalg.norm(measured(found) - found.positions[found.scanner], axis=1) / PLACE.scale / 0.01
-    assert np.abs(lengths - np.rint(lengths)).max() < 1e5 * DOUBLE
-    assert np.abs(along_rays(found)).max() <= 0.005 + 1000 * DOUBLE
 
 
 def test_faults_leave_the_other_random_numbers_alone():

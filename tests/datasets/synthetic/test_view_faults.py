@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets.color_space import srgb_to_linear
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.synthetic.view_faults import VIEW_FAULTS, with_fault
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import Similarity
+from mplicits.neural_fields.meshing.color_space import srgb_to_linear
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from mplicits.datasets import (
     srgb_to_linear,
     write_cloud_ply,
 )
-from mplicits.datasets.textured.mesh import Paint, decode_texture, lookup, pack
+from mplicits.datasets.textured.mesh import Paint, lookup, pack
 from mplicits.neural_fields import InputError
 from mplicits.neural_fields.meshing.extract import Mesh
 from mplicits.pipelines.mesh.files import write_mesh
@@ -455,16 +455,6 @@ def test_samples_are_uniform_by_area_and_repeat():
     np.testing.assert_array_equal(again.points, cloud.points)
     assert not np.array_equal(other.points, cloud.points)
     assert len(sample_textured(mesh, 0, seed=0)) == 0
-
-
-@pytest.mark.parametrize("extension", [".png", ".tiff"])
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-@pytest.mark.parametrize("channels", [1, 3, 4])
-def test_images_of_all_kinds_become_rgb(kind, extension, channels):
-    values = (np.arange(2 * 3 * channels).reshape(2, 3, channels) * (np.iinfo(kind).max // 24)).astype(kind)
-    rgb = np.repeat(values, 3, axis=2) if channels == 1 else values[..., 2::-1]
-    found = decode_texture(cv2.imencode(extension, values)[1].tobytes())
-    np.testing.assert_allclose(found, rgb / np.iinfo(kind).max, atol=1e-6)
 
 
 def test_bad_files_are_one_line(tmp_path):

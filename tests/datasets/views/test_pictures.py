@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import Camera, look_at
-from mplicits.datasets.views.pictures import undistort, undistorted_camera
+from mplicits.datasets.views.images import undistort, undistorted_camera
 
 WIDTH, HEIGHT = 160, 120
 LENSES = {
@@ -90,13 +90,3 @@ def test_without_distortion_the_camera_stays():
 def test_a_lens_that_folds_the_picture_over_is_refused(lens):
     with pytest.raises(ValueError, match="distortion="):
         undistorted_camera(camera(*lens))
-
-
-def test_colours_keep_their_channels():
-    before = camera(*LENSES["barrel"])
-    pinhole = undistorted_camera(before)
-    picture = np.random.default_rng(0).random((HEIGHT, WIDTH, 4), np.float32)
-    together = undistort(picture, before, pinhole)
-    for channel in range(4):
-        alone = undistort(np.ascontiguousarray(picture[..., channel]), before, pinhole)
-        np.testing.assert_allclose(together[..., channel], alone, atol=1e-6)

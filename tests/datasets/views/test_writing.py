@@ -2,7 +2,6 @@
 
 import json
 import math
-import struct
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,12 +12,10 @@ import pytest
 import torch
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
-from mplicits.datasets.views.formats.depth_maps import DepthSource
-from mplicits.datasets.views.formats.reading import read_cameras
-from mplicits.datasets.views.images import PosedImage, PosedImages, read_posed_images
+from mplicits.datasets.views.formats.shots import DepthSource
+from mplicits.datasets.views.images import PosedImage, PosedImages, read_cameras, read_posed_images
 from mplicits.datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
 from mplicits.neural_fields import InputError, Similarity
-from scipy.spatial.transform import Rotation
 
 CENTER, SCALE = (10.0, -4.0, 2.0), 1.7
 
@@ -96,70 +93,6 @@ def test_transforms_have_opengl_poses_and_corners_of_pixels(tmp_path, photograph
     same_cameras([camera for _, camera in read_cameras(tmp_path / "nerf" / "transforms.json")], photographs)
 
 
-def colmap_text(model: Path):
-    """Cameras by number, images ``(w x y z, t, camera, name)`` and points, as COLMAP's documentation has the files."""
-
-    def rows(name):
-        lines = (model / name).read_text().splitlines()
-        return [line.split() for line in lines if not line.startswith("#")]
-
-    cameras = {int(row[0]): (row[1], *map(int, row[2:4]), *map(float, row[4:])) for row in rows("cameras.txt")}
-    lines = rows("images.txt")
-    assert not any(lines[1::2])  # no observations of these
-    images = [(list(map(float, row[1:5])), list(map(float, row[5:8])), int(row[8]), row[9]) for row in lines[::2]]
-    points = np.array([list(map(float, row[1:4])) for row in rows("points3D.txt")])
-    return cameras, images, points
-
-
-def colmap_binary(model: Path):
-    """The same from the binary files."""
-
-    def take(data: bytearray, form: str):
-        form = "<" + form
-        values = struct.unpack_from(form, data)
-        del data[: struct.calcsize(form)]
-        return values
-
-    data = bytearray((model / "cameras.bin").read_bytes())
-    cameras = {}
-    for _ in range(*take(data, "Q")):
-        number, kind, *rest = take(data, "iiQQ4d")
-        cameras[number] = ({1: "PINHOLE"}[kind], *rest)
-    assert not data
-    data, images = bytearray((model / "images.bin").read_bytes()), []
-    for _ in range(*take(data, "Q")):
-        row = take(data, "i7di")
-        name, _, data = data.partition(b"\0")
-        assert take(data, "Q") == (0,)
-        images.append((list(row[1:5]), list(row[5:8]), row[8], name.decode()))
-    assert not data
-    data, points = bytearray((model / "points3D.bin").read_bytes()), []
-    for _ in range(*take(data, "Q")):
-        row = take(data, "Q3d3BdQ")
-        assert row[-1] == 0
-        points.append(row[1:4])
-    assert not data
-    return cameras, images, np.array(points)
-
-
-@pytest.mark.parametrize(("form", "read"), [("text", colmap_text), ("binary", colmap_binary)])
-def test_colmap_projects_world_points_onto_pixels(tmp_path, photographs, form, read):
-    write_colmap(tmp_path / "colmap", photographs, form=form)
-    cameras, images, points = read(tmp_path / "colmap" / "sparse" / "0")
-    assert len(cameras) == 2  # one for each lens, not for each view
-    assert np.array_equal(points, photographs.points)
-    assert len(images) == 4
-    for (quaternion, shift, number, name), view in zip(images, photographs.views, strict=True):
-        model, width, height, fx, fy, cx, cy = cameras[number]
-        assert (model, width, height) == ("PINHOLE", view.camera.width, view.camera.height)
-        seen = Rotation.from_quat(quaternion, scalar_first=True).apply(points) + shift
-        pixels = seen[:, :2] / seen[:, 2:] * [fx, fy] + [cx, cy]
-        expected, _ = view.camera.project(torch.from_numpy(points))
-        assert np.abs(pixels - 0.5 - expected.numpy()).max() < 1e-9  # COLMAP counts from the image's corner
-        picture = iio.imread(tmp_path / "colmap" / "images" / name)
-        assert np.array_equal(picture, bytes_of(np.concatenate((view.color, view.mask[..., None]), axis=-1)))
-
-
 @pytest.mark.parametrize("name", WRITERS)
 def test_what_is_read_is_what_was_written(tmp_path, photographs, name):
     WRITERS[name](tmp_path / "data", photographs)
@@ -233,7 +166,6 @@ def test_pictures_without_masks_have_no_alpha(tmp_path, photographs):
     assert iio.imread(tmp_path / "nerf" / "images" / "000.png").shape == (6, 8, 3)
     write_colmap(tmp_path / "colmap", bare, form="text")
     assert iio.imread(tmp_path / "colmap" / "images" / "000.png").shape == (6, 8, 3)
-    assert colmap_text(tmp_path / "colmap" / "sparse" / "0")[2].size == 0
     write_neus(tmp_path / "neus", bare)
     assert iio.imread(tmp_path / "neus" / "mask" / "000.png").min() == 255
 

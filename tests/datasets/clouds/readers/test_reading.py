@@ -348,7 +348,7 @@ GRID = "\n".join(f"{i} {i * i} 1" for i in range(20))
         ("a.xyz", GRID.replace("25 1", "25 one").encode(), "line 6: 'one' is not a number"),
         ("a.xyz", b"1 2 3 4 5\n5 6 7 8 9\n", "line 1: 5 columns; without names.*--columns x,y,z,nx,ny"),
         ("a.xyz", b"\x00\x01\x02", "binary data"),
-        ("a.xyz", b"# only\n\n# comments\n", "only comments"),
+        ("a.xyz", b"# only\n\n# comments\n", "no numbers"),
         ("a.xyz", b"x y z\n", "no numbers"),
         ("a.xyz", b"nan nan nan\n" * 20, "none with finite coordinates among 20"),
         ("a.xyz", b"1 2 3\n" * 20, "all 20 coincide"),

@@ -7,7 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
-from mplicits.datasets.views.formats.depth_maps import DepthSource
+from mplicits.datasets.views.formats.shots import DepthSource
 from mplicits.datasets.views.images import read_posed_images
 from mplicits.datasets.views.writing import write_transforms
 from mplicits.neural_fields import InputError

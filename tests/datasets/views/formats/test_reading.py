@@ -170,17 +170,6 @@ def test_what_is_wrong_with_a_transforms_json_is_said_in_one_line(content, messa
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["{", "", "\x00\x01"])
-def test_what_is_not_json_says_so(text, tmp_path):
-    path = tmp_path / "transforms.json"
-    path.write_text(text)
-    with pytest.raises(InputError, match=r"transforms\.json: is not JSON"):
-        read_cameras(path)
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match=r"transforms\.json: is not JSON"):
-        read_cameras(path)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

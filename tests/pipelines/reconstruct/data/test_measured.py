@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
-from mplicits.datasets.views.formats.depth_maps import DepthKind
+from mplicits.datasets.views.formats.shots import DepthKind
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import InputError, Jet, Similarity, Sphere, Union, render_volume
 from mplicits.neural_fields.volume.render import Sampling
