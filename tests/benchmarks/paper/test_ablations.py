@@ -22,7 +22,6 @@ from benchmarks.harness.run import run_cell
 from benchmarks.paper.ablations import (
     DELTA_FACTOR,
     LOSS_WEIGHTS,
-    loss_weight_tables,
 )
 from benchmarks.paper.base import (
     Base,
@@ -288,40 +287,6 @@ def test_grid_seconds_count_what_was_left_out() -> None:
 def record(method: str, outputs: list[dict[str, Any]], *, shape: str = "ball", **more: Any) -> dict[str, Any]:
     cell = {"shape": shape, "method": method, "preset": "cpu", "noise": 0.0, "overrides": {}} | more.pop("cell", {})
     return {"cell": cell, "outputs": outputs, "deltas": [], "details": {}, "environment": {"device": "cpu"}} | more
-
-
-def test_loss_weight_rows() -> None:
-    def at(shape: str, level: int, errors: dict[float, float]) -> dict[str, Any]:
-        outputs = [{"name": f"{w:g}", "weight": w, "error": e} for w, e in errors.items()]
-        cell = {"overrides": {"constraint": "normal", "level": level}}
-        return record(
-            "loss-weights", outputs, shape=shape, cell=cell, details={"without": 0.5 * level, "fit": 0.1 * level}
-        )
-
-    records = [
-        record("ours", [{"name": "Ours fine", "chamfer": 1.0}]),
-        at("ball", 1, {0: 0.1, 100: 0.2}),
-        at("ball", 2, {0: 0.01, 100: 0.02}),
-        at("cube", 1, {0: 0.3, 100: 0.4}),
-    ]
-    (table,) = loss_weight_tables(records)
-    assert table.name == "loss-weights-normal"
-    names = ["0", "100", "level not trained at all", "the finished fit, its own weights"]
-    assert [row.name for row in table.rows] == names
-    assert table.rows[0].values == pytest.approx((0.2, 0.01))
-    assert table.rows[1].values == pytest.approx((0.3, 0.02))
-    assert table.rows[2].values == pytest.approx((0.5, 1.0))
-    assert table.rows[3].values == pytest.approx((0.1, 0.2))
-    assert table.rows[0].published == (0.0073, 0.0017)
-    assert table.rows[1].published == (0.0081, 0.0013)
-    assert "ball, cube" in table.notes[0]
-    (plot,) = LOSS_WEIGHTS.plots(records)
-    assert plot.places == ("0", "100")
-    assert [series.name for series in plot.series] == [
-        f"{level} level{whose}" for level in ("medium", "fine") for whose in ("", ", paper")
-    ]
-    assert plot.series[0].values == pytest.approx((0.2, 0.3))
-    assert plot.series[1].values == (0.0073, 0.0081)
 
 
 def test_isolation_rows() -> None:

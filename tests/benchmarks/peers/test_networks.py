@@ -127,15 +127,6 @@ def test_bacon_is_a_sum_of_the_sines_that_its_bound_allows() -> None:
     torch.testing.assert_close(field.value(x), expected * head.weight[0, 0] + head.bias[0])
 
 
-def test_bacon_has_the_published_size_but_for_what_is_never_used() -> None:
-    field = BaconSDF()
-    assert field.harmonics(level=-1) == 192
-    # 530,953 with five filters and five outputs that take no part.
-    assert sum(p.numel() for p in field.parameters()) == 530_953 - 5 * 256 - 5 * 257
-    assert field.parameters_to(-1) == sum(p.numel() for p in field.parameters()) - 3 * 257
-    assert field.parameters_to(0) == 256 + 2 * 257 * 256 + 257
-
-
 def test_idf_without_displacement_is_its_base() -> None:
     field = small_idf().double()
     x = 2 * torch.rand(200, 3, dtype=torch.float64) - 1

@@ -4,7 +4,6 @@ import dataclasses
 import json
 from pathlib import Path
 
-import imageio.v3 as iio
 import pytest
 import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
@@ -241,23 +240,6 @@ def files_of(bench, folder: str, suffix: str) -> dict[str, Path]:
     out, ours, *_ = bench
     key = Catalogue([ours]).key
     return {part.parameters["kind"]: out / folder / f"{key(part)}{suffix}" for part in ours.cells()}
-
-
-def test_pictures_and_meshes(bench):
-    out = bench[0]
-    for folder, suffix in (("cells", ".json"), ("pictures", "-views.png"), ("meshes", "-surface.ply")):
-        assert {*(out / folder).iterdir()} == {*files_of(bench, folder, suffix).values()}
-    factor = 600 // 24
-    sheet = iio.imread(files_of(bench, "pictures", "-views.png")[NEUS])
-    assert sheet.shape == (12 * factor, 24 * factor, 3)
-    common = iio.imread(out / "painted-sphere.png")
-    assert common.shape == (2 * (8 * factor + 40), 4 * (8 * factor + 12), 3)
-    # The photograph, then what NeuS renders, as they are on its own sheet.
-    side = 8 * factor
-    for column in range(2):
-        left = 6 + column * (side + 12)
-        assert (common[40 : 40 + side, left : left + side] == sheet[:side, column * side : (column + 1) * side]).all()
-    assert (common[80 + side :, side + 18 : 2 * side + 18] == sheet[:side, 2 * side :]).all()
 
 
 def test_finished_rows_are_used_again(bench):

@@ -67,25 +67,6 @@ def test_between_texels_light_is_interpolated_linearly():
     np.testing.assert_allclose(srgb_to_linear(shown)[2, 3], expected, atol=1e-5)
 
 
-def test_a_tilted_square_is_interpolated_in_space_and_not_on_the_screen():
-    turn = trimesh.transformations.rotation_matrix(1.1, [0.0, 1.0, 0.0])[:3, :3]
-    camera = look_at((0.3, 0.4, 3.0), (0.0, 0.0, 0.0), fov=50, width=60, height=40)
-    seen = mesh_view(square(ramp(64), CORNERS @ turn.T), camera)
-    eye, directions = camera.rays(dtype=torch.float64)
-    rays = directions.reshape(-1, 3).numpy() @ turn  # in the square's own axes
-    start = eye.numpy() @ turn
-    hit = start - (start[2] / rays[:, 2])[:, None] * rays
-    inside = (np.abs(hit[:, :2]) < 1).all(axis=1) & (-start[2] / rays[:, 2] > 0)
-    assert inside.sum() > 200
-    assert seen.pixel.tolist() == np.flatnonzero(inside).tolist()
-    np.testing.assert_allclose(seen.position.numpy() @ turn, hit[inside], atol=1e-5)
-    # Nearer to the image's sides than half a texel, the texture repeats.
-    inner = (np.abs(hit[inside, :2]) < 1 - 1 / 64).all(axis=1)
-    assert seen.color is not None
-    light = srgb_to_linear(seen.color.numpy())[inner]
-    np.testing.assert_allclose(light[:, :2], (hit[inside, :2][inner] + 1) / 2, atol=1e-4)
-
-
 def test_map_coordinates_lose_nothing():
     away = np.array([400_000.0, 5_600_000.0, 100.0])
     near = mesh_view(square(ramp(32)), front(24))
