@@ -10,7 +10,7 @@ from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.training.settings import FitConfig
 
 from benchmarks.cli import main
-from benchmarks.costs.render import NETWORKS, RenderBench, RenderRow, naive_view
+from benchmarks.costs.render import RenderBench, RenderRow, naive_view
 from benchmarks.costs.render_truth import Truth
 
 SMALL = {
@@ -67,15 +67,6 @@ def test_coarse_levels_carry_the_trace(bench):
     coarse, mapped = rows[1], rows[2]
     assert mapped.evaluations[0] == coarse.evaluations[0]
     assert mapped.evaluations[1] == pytest.approx(math.pi / 4 * 0.8, abs=0.25)
-
-
-def test_the_networks_are_the_papers():
-    sizes = {name: [(width, depth) for width, depth, *_ in levels] for name, levels in NETWORKS.items()}
-    assert sizes == {
-        "400x4": [(400, 4)],
-        "128x2_256x2_400x2": [(128, 2), (256, 2), (400, 2)],
-        "128x2_400x2": [(128, 2), (400, 2)],
-    }
 
 
 @pytest.mark.slow

@@ -15,14 +15,11 @@ from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import banded_sources
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.surface.distance import MeshDistance, barycentric_of_nearest
+from mplicits.pipelines.surface.distance import MeshDistance
 
 from benchmarks.harness.cells import make_folder
 from benchmarks.harness.run import run_cell
-from benchmarks.paper.ablations import (
-    DELTA_FACTOR,
-    LOSS_WEIGHTS,
-)
+from benchmarks.paper.ablations import DELTA_FACTOR, LOSS_WEIGHTS
 from benchmarks.paper.base import (
     Base,
     delta_after,
@@ -52,65 +49,6 @@ CUBOID = Mesh(
         ]
     ),
 )
-
-
-# Exact distances
-
-
-@pytest.mark.parametrize(
-    ("point", "expected"),
-    [
-        ((0.2, 0.3, 1.0), (0.5, 0.2, 0.3)),  # above the inside
-        ((-1.0, -1.0, 0.5), (1, 0, 0)),
-        ((2.0, -0.5, 0.0), (0, 1, 0)),
-        ((0.5, -1.0, 0.0), (0.5, 0.5, 0)),
-        ((1.0, 1.0, 0.0), (0, 0.5, 0.5)),
-        ((-1.0, 0.25, 0.0), (0.75, 0, 0.25)),
-    ],
-)
-def test_nearest_point_of_a_triangle(point: tuple[float, ...], expected: tuple[float, ...]) -> None:
-    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    weights = barycentric_of_nearest(np.array(point), corners)
-    np.testing.assert_allclose(weights, expected, atol=1e-15)
-    assert [w == 0 for w in weights] == [e == 0 for e in expected]
-
-
-def test_distances_to_a_box_are_exact_inside_outside_and_over_its_edges() -> None:
-    points = np.random.default_rng(0).uniform(-1, 1, (3000, 3))
-    q = np.abs(points) - HALF
-    exact = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
-    np.testing.assert_allclose(MeshDistance(CUBOID).signed(points), exact, atol=1e-14)
-
-
-@pytest.mark.slow
-def test_long_faces_beside_many_small_ones_hide_nobody() -> None:
-    # A large triangle far below a finely triangulated patch: its centre is much further away than it is.
-    grid = np.linspace(-0.05, 0.05, 30)
-    x, y = np.meshgrid(grid, grid, indexing="ij")
-    patch = np.stack((x, y, np.full_like(x, 0.2)), axis=-1).reshape(-1, 3)
-    corner = np.arange(30 * 30).reshape(30, 30)[:-1, :-1].reshape(-1)
-    faces = np.concatenate((corner[:, None] + [0, 30, 1], corner[:, None] + [1, 30, 31]))
-    vertices = np.concatenate((patch, [[-1, -1, 0], [1, -1, 0], [0, 2, 0]]))
-    both = Mesh(vertices, np.concatenate((faces, len(patch) + np.array([[0, 1, 2]]))))
-    points = np.array([[0.0, -0.9, 0.03], [0.03, 0.02, 0.06], [0.03, 0.02, 0.14], [0.0, 0.0, 0.25]])
-    np.testing.assert_allclose(MeshDistance(both).signed(points), [0.03, 0.06, -0.06, 0.05], atol=1e-14)
-
-
-def test_sign_at_a_sharp_tip_is_that_of_all_faces_around_it() -> None:
-    # Past the tip of a flat needle two of its faces, taken alone, would say inside.
-    tip = Mesh(
-        np.array([[1.0, 0, 0], [0, 0.2, 0], [0, -0.1, 0.17], [0, -0.1, -0.17]]),
-        np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]),
-    )
-    directions = np.random.default_rng(1).normal(size=(500, 3)) * 0.1
-    directions[:, 0] = np.abs(directions[:, 0]) + 0.3
-    assert (MeshDistance(tip).signed(np.add([1, 0, 0], directions)) > 0).all()
-    assert MeshDistance(tip).signed(np.array([[0.5, 0.0, 0.0]]))[0] < 0
-
-
-def test_a_surface_without_faces_has_no_distances() -> None:
-    with pytest.raises(ValueError, match="no faces"):
-        MeshDistance(Mesh(np.eye(3), np.array([[0, 0, 1]])))
 
 
 def test_approximation_error_of_an_exact_and_of_a_shifted_field() -> None:
@@ -313,12 +251,7 @@ def test_isolation_rows() -> None:
     assert a.published is not None
     assert a.published[:4] == (6.39e-5, 1.49e-5, 1.45e-3, 0.687)
     assert a.published[6:10] == (3.87e-5, 1.38e-5, 5.86e-3, 0.653)
-    assert [row.values for row in culling.rows] == [
-        (2.0, "1 to 3"),
-        (1.5, "1"),
-        (5.0, "2"),
-        (50.0, "1,234"),
-    ]
+    assert [row.values for row in culling.rows] == [(2.0, "1 to 3"), (1.5, "1"), (5.0, "2"), (50.0, "1,234")]
     assert culling.rows[3].published == (2.8e-1, "365 to 4,109")
 
 

@@ -155,12 +155,7 @@ def test_no_surface_is_a_result(ball: Path, out: Path) -> None:
 
 def test_a_failure_stops_nothing_and_is_tried_again(ball: Path, out: Path) -> None:
     good, bad = Exact("good"), Exact("bad", radius=None)
-    methods = Catalogue(
-        (
-            good,
-            bad,
-        )
-    )
+    methods = Catalogue((good, bad))
     cells = [PaperCell(ball, "bad", "smoke"), PaperCell(ball, "good", "smoke")]
     lines: list[str] = []
     ran = run_cells(cells, out, methods, say=lines.append)
@@ -213,12 +208,7 @@ def test_ctrl_c_keeps_what_is_finished(ball: Path, out: Path, reason: BaseExcept
             raise reason
 
     good, stopped = Exact("good"), Stopped("stopped")
-    methods = Catalogue(
-        (
-            good,
-            stopped,
-        )
-    )
+    methods = Catalogue((good, stopped))
     cells = [PaperCell(ball, "good", "smoke"), PaperCell(ball, "stopped", "smoke")]
     with pytest.raises(type(reason)):
         run_cells(cells, out, methods, say=lambda _: None)

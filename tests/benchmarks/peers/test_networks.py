@@ -29,7 +29,6 @@ from benchmarks.paper.networks import (
     IdfRecipe,
     SirenRecipe,
     SirenWeights,
-    _CloudBatches,
     begin_as_sphere,
     displaced,
     laplacian_samples,
@@ -254,14 +253,6 @@ def test_sphere_start_reaches_into_the_corners_of_the_cube(omega: float) -> None
     value, distance = network.value(x).detach(), x.norm(dim=1)
     assert float((value - (distance - 0.4)).abs().mean()) < 0.02
     assert bool((value[distance > 1] > 0.2).all())
-
-
-def test_batches_hold_the_share_of_points_off_the_surface(sphere: OrientedCloud) -> None:
-    points, normals = _CloudBatches(sphere, 200, 0.6, seed=0, device="cpu").draw()
-    assert (len(points), len(normals)) == (200, 80)
-    torch.testing.assert_close(points[:80].norm(dim=1), torch.ones(80), atol=2e-3, rtol=0)
-    torch.testing.assert_close(points[:80], normals, atol=0.05, rtol=0)
-    assert float(points[80:].norm(dim=1).std()) > 0.1
 
 
 def test_laplacian_samples_have_their_spread_and_stay_in_the_period(sphere: OrientedCloud) -> None:

@@ -108,17 +108,6 @@ def test_screened_poisson_when_installed(ball: Path, tmp_path: Path) -> None:
     assert rows[-1].metrics.iou > 0.95
 
 
-def test_screened_poisson_on_what_ours_has_smoothed(ball: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
-    bench = FitBench(shapes=[ball], config=SMALL, noise=0.02, resolution=32, samples=5000, poisson_depth=6)
-    rows = bench.rows(tmp_path)
-    assert [row.method for row in rows[-2:]] == ["screened Poisson", "screened Poisson, smoothed"]
-    noisy, smoothed = (row.metrics for row in rows[-2:])
-    assert noisy is not None
-    assert smoothed is not None
-    assert smoothed.chamfer - smoothed.chamfer_floor < (noisy.chamfer - noisy.chamfer_floor) / 3
-
-
 def test_the_camera_faces_the_widest_side() -> None:
     gear = Mesh(*PRISMS["gear"]())  # the two flat sides
     normals, areas = face_normals(gear)

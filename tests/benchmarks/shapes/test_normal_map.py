@@ -10,15 +10,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import turntable
-from mplicits.neural_fields import (
-    Field,
-    MultiscaleSDF,
-    Similarity,
-    Siren,
-    Sphere,
-    extract_mesh,
-    save_field,
-)
+from mplicits.neural_fields import Field, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh, save_field
 from mplicits.neural_fields.checkpoint import SavedField
 from mplicits.pipelines.mesh.files import write_mesh
 
@@ -125,14 +117,6 @@ def test_the_angle_between_normals_in_closed_form(opened, tmp_path):
         cosine = (hit * other).sum(axis=1) / np.linalg.norm(hit, axis=1) / np.linalg.norm(other, axis=1)
         angles.append(np.degrees(np.arccos(cosine.clip(-1, 1))))
     assert rows[1].degrees == pytest.approx(np.concatenate(angles).mean(), rel=5e-3)
-
-
-@pytest.mark.slow
-def test_lambert_and_normals_are_compared_too(opened, tmp_path):
-    bench = opened(bumpy_ball(), 1)
-    for shading in ("lambert", "normals"):
-        rows = dataclasses.replace(bench, shading=shading).rows(tmp_path / "out")
-        assert rows[4].error.both < rows[1].error.both < rows[0].error.both
 
 
 def test_the_command(tmp_path, capsys):

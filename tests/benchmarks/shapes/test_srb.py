@@ -30,9 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sphere of radius 14 around (5, 0, −1): its surface, a scan of it with normals, and one without."""
     folder = tmp_path_factory.mktemp("srb")
     write_mesh(
-        folder / "bigball.ply",
-        extract_mesh(Sphere(radius=RADIUS), resolution=64),
-        Similarity((5.0, 0.0, -1.0), SCALE),
+        folder / "bigball.ply", extract_mesh(Sphere(radius=RADIUS), resolution=64), Similarity((5.0, 0.0, -1.0), SCALE)
     )
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(4000, 3))

@@ -6,16 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from mplicits.neural_fields import (
-    Box,
-    Mesh,
-    Similarity,
-    Sphere,
-    Union,
-    extract_mesh,
-    load_field,
-    save_field,
-)
+from mplicits.neural_fields import Box, Mesh, Similarity, Sphere, Union, extract_mesh, load_field, save_field
 from mplicits.pipelines.cli import entry as cli
 from mplicits.pipelines.mesh.solids import length_in
 from mplicits.pipelines.surface.distance import MeshField
@@ -52,11 +43,7 @@ A, B = 4 / 3 * math.pi * RADIUS**3, 4 / 3 * math.pi * OTHER**3
 
 @pytest.mark.parametrize(
     ("operation", "exact"),
-    [
-        ("union", A + B - volume_of_lens()),
-        ("intersection", volume_of_lens()),
-        ("difference", A - volume_of_lens()),
-    ],
+    [("union", A + B - volume_of_lens()), ("intersection", volume_of_lens()), ("difference", A - volume_of_lens())],
 )
 def test_two_balls(balls: Path, operation: str, exact: float) -> None:
     second = "b.stl" if operation == "difference" else "b.safetensors"

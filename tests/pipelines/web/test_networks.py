@@ -8,13 +8,7 @@ import pytest
 import torch
 from fields import small_multiscale
 from mplicits.neural_fields import Siren
-from mplicits.pipelines.web.payload import (
-    Payload,
-    network_layers,
-    pack_codes,
-    rounded_field,
-    rounding_error,
-)
+from mplicits.pipelines.web.payload import Payload, network_layers, pack_codes, rounded_field, rounding_error
 
 
 def evaluate(layers, points):
