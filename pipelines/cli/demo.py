@@ -12,16 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ...datasets import (
-    STATUE_PLACEMENT,
-    Camera,
-    PointCloud,
-    Statue,
-    orbit,
-    read_cloud,
-    statue_scan,
-    write_cloud_ply,
-)
+from ...datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
 from ...datasets.synthetic.samples import feet_and_normals
 from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.backend.files import check_place
@@ -46,12 +37,7 @@ TILE = (480, 640)
 
 
 def demo(
-    cloud: str | Path | None,
-    out: str | Path,
-    *,
-    config: FitConfig,
-    up: str | None = None,
-    resolution: int = 320,
+    cloud: str | Path | None, out: str | Path, *, config: FitConfig, up: str | None = None, resolution: int = 320
 ) -> int:
     """Fit a cloud, write its meshes and a picture into ``out``, and print figures.
 

@@ -164,10 +164,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             _info,
         ),
         "doctor": Command(
-            "check this installation and measure this machine",
-            "  mplicits doctor",
-            lambda _parser: None,
-            _doctor,
+            "check this installation and measure this machine", "  mplicits doctor", lambda _parser: None, _doctor
         ),
         "sample": Command(
             "write the bundled scan of a statue, or the mesh of a solid with sharp edges",

@@ -116,12 +116,7 @@ def _field_subject(
 
 
 def subject_of(
-    field: Field,
-    similarity: Similarity,
-    *,
-    name: Path,
-    panels: Sequence[Panel],
-    colors: Colors | None = None,
+    field: Field, similarity: Similarity, *, name: Path, panels: Sequence[Panel], colors: Colors | None = None
 ) -> Subject:
     """A three-dimensional field to draw, evaluated on its own device; ``name`` is for messages."""
     device = field.like.device

@@ -171,12 +171,7 @@ def _nearest_points(xy: Float64, z: Float64, size: tuple[int, int], diameter: fl
 
 
 def picture_of(
-    surface: Mesh,
-    camera: Camera,
-    *,
-    point_size: float | None = None,
-    samples: int = 2,
-    shading: str | None = None,
+    surface: Mesh, camera: Camera, *, point_size: float | None = None, samples: int = 2, shading: str | None = None
 ) -> Image:
     """A picture of a mesh, or of a cloud as discs, on white, as ``mplicits render`` draws it by default.
 

@@ -338,14 +338,7 @@ def shade(
     return colors * (1 - options.relief * (1 - _facing(seen)))[:, None]
 
 
-def measure(
-    seen: Seen,
-    shading: str,
-    *,
-    field: Field | None = None,
-    level: int = -1,
-    detail: float = 4e-3,
-) -> Tensor:
+def measure(seen: Seen, shading: str, *, field: Field | None = None, level: int = -1, detail: float = 4e-3) -> Tensor:
     """The numbers ``(P,)`` that "depth" and "curvature" show, in the units of ``seen``.
 
     ``detail`` is the step of `level_set_curvature`. Raises a ValueError if a field is missing.

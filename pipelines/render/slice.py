@@ -103,14 +103,7 @@ class Slice:
 
 
 def take_slice(
-    field: Field,
-    *,
-    origin: Vector,
-    u: Vector,
-    v: Vector,
-    half_size: float,
-    size: tuple[int, int],
-    level: int = -1,
+    field: Field, *, origin: Vector, u: Vector, v: Vector, half_size: float, size: tuple[int, int], level: int = -1
 ) -> Slice:
     """Evaluate every level up to ``level``, each one only in the band of the one before; see `slice_points`."""
     level = field.resolve_level(level)

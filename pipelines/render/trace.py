@@ -190,13 +190,7 @@ def see_hits(
 
 
 def trace_hits(
-    field: Field,
-    camera: Camera,
-    eye: Tensor,
-    directions: Tensor,
-    *,
-    level: int,
-    budget: Sequence[int] | None = None,
+    field: Field, camera: Camera, eye: Tensor, directions: Tensor, *, level: int, budget: Sequence[int] | None = None
 ) -> Hits:
     """Trace the rays ``(H, W, 3)`` of a camera to a tenth of a pixel, tiles of them first."""
     if budget is not None:

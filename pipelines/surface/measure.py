@@ -329,10 +329,7 @@ def _crossings(
 
 
 def _inside_lengths(
-    first: tuple[Int64, Float64, NDArray[np.int8]],
-    second: tuple[Int64, Float64, NDArray[np.int8]],
-    *,
-    size: int,
+    first: tuple[Int64, Float64, NDArray[np.int8]], second: tuple[Int64, Float64, NDArray[np.int8]], *, size: int
 ) -> tuple[Float64, int, int]:
     """Total lengths inside first, second, both, either; columns met; columns broken (and left out)."""
     sums = [np.bincount(c, weights=s, minlength=size) for c, _, s in (first, second)]

@@ -79,11 +79,7 @@ class Packed(NamedTuple):
 
 
 def web_run(
-    source: str | Path,
-    out: str | Path,
-    options: WebOptions | None = None,
-    *,
-    say: Callable[[str], None] | None = None,
+    source: str | Path, out: str | Path, options: WebOptions | None = None, *, say: Callable[[str], None] | None = None
 ) -> WebPage:
     """Write a page that shows a run, a mesh or a cloud and needs nothing else, or a folder for another page.
 
