@@ -42,7 +42,7 @@ DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".npz")
 def readable(path: Path, *, missing: str = "check the path") -> Iterator[None]:
     """A block that reads ``path``: any error becomes an `InputError` of one line, and libraries print nothing.
 
-    ``missing`` says what to do if there is no such file.
+    ``missing`` is the advice if there is no such file.
     """
     with damage(path, "export it again"), _silence:
         try:
@@ -190,8 +190,8 @@ def read_rgb(path: Path) -> tuple[NDArray[Any], NDArray[Any] | None]:
 def decode_image(data: bytes) -> NDArray[Any]:
     """The bytes of an image file → ``(H, W)``, ``(H, W, 3)`` RGB or ``(H, W, 4)`` RGBA, with the bits of the file.
 
-    EXIF orientations are ignored: cameras and texture coordinates belong to the pixels as stored. A ValueError says
-    that the bytes are no known image.
+    EXIF orientations are ignored: cameras and texture coordinates belong to the pixels as stored. A ValueError is
+    raised for bytes that are no known image.
     """
     _check_pixels(data)
     # imread gives no reason for a failure, and has trouble with names that are not ASCII.

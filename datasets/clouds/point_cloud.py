@@ -1,4 +1,4 @@
-"""``PointCloud``: points as a file holds them; the meaning of stored numbers; thinning by voxels."""
+"""``PointCloud``: points as a file holds them; the meaning of stored numbers; thinning, welding, points on faces."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def thin(cloud: PointCloud, max_points: int) -> PointCloud:
     return cloud if len(cloud) <= max_points else select(cloud, spread(cloud.points, max_points))
 
 
-def spread(points: Float64, max_points: int, *, steps: int = 12) -> NDArray[np.int64]:
+def spread(points: Float64, max_points: int, *, steps: int = 12) -> Int64:
     """Ascending indices of at most ``max_points`` finite points ``(N, 3)``: one for each voxel.
 
     The voxel is the smallest that leaves few enough, by bisection; 12 ``steps`` leave it a few percent too large.
@@ -131,7 +132,7 @@ def spread(points: Float64, max_points: int, *, steps: int = 12) -> NDArray[np.i
     return voxel_representatives(points, float(cells.extent.max()) * 2**high)
 
 
-def voxel_representatives(points: Float64, size: float) -> NDArray[np.int64]:
+def voxel_representatives(points: Float64, size: float) -> Int64:
     """Ascending indices of one point ``(N, 3)`` per voxel: the one nearest the mean of the voxel's points."""
     keys = _Cells(points).keys(size)
     order = np.argsort(keys, kind="stable")
@@ -174,6 +175,34 @@ def spacing_of(points: Float64, *, share: float = 0.95, sample: int = 20_000) ->
     return float(np.quantile(KDTree(shifted).query(asked, k=2)[0][:, 1], share))
 
 
+def weld(vertices: Float64) -> tuple[Int64, Int64]:
+    """The first of each set of equal rows of ``vertices`` ``(N, K)``: indices ``(M,)``, rows in ascending order.
+
+    The second result is the place of each old row among them ``(N,)``.
+    """
+    order = np.lexsort((vertices + 0.0).T)  # stable: among equals the first comes first; + 0.0: minus zero is zero
+    ordered = vertices[order]
+    first = np.ones(len(vertices), bool)
+    first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    index = np.empty(len(vertices), np.int64)
+    index[order] = np.cumsum(first) - 1
+    return order[first], index
+
+
+def spread_on_faces(areas: Float64, count: int, rng: np.random.Generator) -> tuple[Int64, Float64]:
+    """Places uniform by area: their faces ``(count,)``, ascending, and weights ``(count, 3)`` of the faces' corners.
+
+    ``areas`` are ``(F,)`` of the faces, or numbers in proportion to them.
+    """
+    total = np.cumsum(areas)
+    if not total[-1] > 0:
+        raise ValueError("surface: all of its faces have zero area")
+    face = np.searchsorted(total, rng.uniform(0, total[-1], count), side="right").clip(max=len(total) - 1)
+    face = np.sort(face)  # neighbours in memory are then neighbours in space, which k-d trees like
+    root, second = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
+    return face, np.stack((1 - root, root * (1 - second), root * second), axis=1)
+
+
 class _Cells:
     """Points ``(N, 3)`` in grids of any cell size, which begin at the points' lowest corner."""
 
@@ -181,7 +210,7 @@ class _Cells:
         self._offsets = (points - points.min(axis=0)).T.copy()  # (3, N)
         self.extent: Float64 = self._offsets.max(axis=1)
 
-    def keys(self, size: float) -> NDArray[np.int64]:
+    def keys(self, size: float) -> Int64:
         """One integer per point, ``(N,)``, the same within a voxel with sides of ``size``."""
         sides = np.floor(self.extent / size).astype(np.int64) + 1
         x, y, z = (np.floor(axis / size).astype(np.int64) for axis in self._offsets)
@@ -192,6 +221,6 @@ class _Cells:
         return int(begins(np.sort(self.keys(size))).sum())
 
 
-def begins(ordered: NDArray[np.int64], step: int = 0) -> NDArray[np.bool_]:
+def begins(ordered: Int64, step: int = 0) -> NDArray[np.bool_]:
     """A mask of the numbers that are not the one before plus ``step``; true at the first."""
     return np.concatenate(([True], ordered[1:] != ordered[:-1] + step))[: len(ordered)]

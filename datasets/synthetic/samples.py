@@ -26,9 +26,9 @@ def sample_surface(
 ) -> PointCloud:
     """Sample ``count`` points of a field's zero set, evenly by area, with exact normals.
 
-    Points uniform in the shell |f| < ``shell``·|∇f| are projected on the surface. A shell of half-width h holds
-    2h(1 + K h²/3) of volume per area, K being the Gaussian curvature (Steiner's formula), so the density is even to
-    within K h²/3: 0.3 % where both radii of curvature are 0.1 and h is 0.01.
+    Points uniform in the shell |f| < ``shell``·|∇f| are projected on the surface. By Steiner's formula, a shell of
+    half-width h holds 2h(1 + K h²/3) of volume per area, with the Gaussian curvature K. So the density is even to
+    within K h²/3: 0.3 % for radii of curvature of 0.1 and h = 0.01.
 
     Args:
         field: of three dimensions; its finest level is sampled.

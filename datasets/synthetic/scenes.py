@@ -287,7 +287,7 @@ def cameras_around(
 def developed(light: NDArray[np.floating], mask: NDArray[np.bool_], samples: int) -> tuple[Float32, Float32]:
     """The mean light of the rays of each pixel that hit, as display RGB ``(H, W, 3)``, and their share ``(H, W)``.
 
-    ``light`` ``(H · samples, W · samples, 3)`` is linear, and 0 where ``mask`` says that the ray misses.
+    ``light`` ``(H · samples, W · samples, 3)`` is linear, and 0 where ``mask`` is false: the ray misses.
     """
     height, width = (side // samples for side in mask.shape)
     tiles = (height, samples, width, samples)

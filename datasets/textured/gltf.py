@@ -279,7 +279,7 @@ def _joined(pieces: list[_Piece], paints: list[Paint], source: str) -> TexturedM
     if any(piece.colors is not None for piece in pieces):
         light = [np.ones_like(piece.vertices) if piece.colors is None else piece.colors for piece in pieces]
         colors = linear_to_srgb(np.concatenate(light)).astype(np.float32)
-    if all((paint.image == 1).all() for paint in paints):  # white paint says nothing
+    if all((paint.image == 1).all() for paint in paints):  # white only: no texture
         return TexturedMesh(vertices, faces, None, None, colors, source)
     chosen = np.repeat([piece.paint for piece in pieces], [len(piece.faces) for piece in pieces])
     image, parts = pack(paints, chosen)

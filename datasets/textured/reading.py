@@ -10,8 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ...neural_fields import InputError
-from ..clouds.point_cloud import PointCloud
-from ..clouds.readers.meshes import spread_on_faces, weld
+from ..clouds.point_cloud import PointCloud, spread_on_faces, weld
 from ..clouds.readers.ply import read_ply_mesh
 from ..files import readable
 from .gltf import read_gltf

@@ -131,7 +131,7 @@ def _posed(
             observations[:, 0] = (np.cumsum(whole) - 1)[observations[:, 0]]
     views = tuple(_view(shot, width, depths) for shot in shots)
     if all(view.mask is None or view.mask.min() > OPAQUE for view in views):
-        views = tuple(replace(view, mask=None) for view in views)  # white masks in all views say nothing
+        views = tuple(replace(view, mask=None) for view in views)  # white in all views: no mask
     if region is not None:
         similarity, words = region, "given"
     elif sphere is not None:
@@ -149,7 +149,7 @@ def _counted(source: Path, shots: Sequence[Shot], placed: int, *, allow_missing:
     """One line: the number of photographs, and of those that have a camera; an InputError if these are too few."""
     photographs = len({shot.image for shot in shots})
     folders = {shot.image.parent for shot in shots}
-    if source.is_dir() or source.name == "transforms.json":  # others hold a choice on purpose: training views, say
+    if source.is_dir() or source.name == "transforms.json":  # other files may hold a choice, such as training views
         kinds = {shot.image.suffix.lower() for shot in shots}
         listed = {file for folder in folders for file in list_images(folder) if file.suffix.lower() in kinds}
         extras = {file for shot in shots for file in (shot.mask, shot.depth) if file is not None}
@@ -322,7 +322,7 @@ def undistorted_camera(camera: Camera) -> Camera:
     """The pinhole at the same place, with as many pixels, all of which the distorted image covers.
 
     Its image is the largest rectangle, in the plane at depth 1, with none of the distorted image's border inside it. A
-    ValueError says that the distortion folds the image over.
+    ValueError is raised if the distortion folds the image over.
     """
     if not camera.distortion:
         return camera

@@ -16,8 +16,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...datasets import PointCloud, read_cloud, spacing_of
-from ...datasets.clouds.point_cloud import unit_rows, voxel_representatives
-from ...datasets.clouds.readers.meshes import spread_on_faces
+from ...datasets.clouds.point_cloud import spread_on_faces, unit_rows, voxel_representatives
 from ...datasets.clouds.readers.reading import read_mesh
 from ...datasets.textured.gltf import read_gltf
 from ...neural_fields import InputError, Mesh

@@ -92,11 +92,6 @@ def test_what_is_wrong_is_one_line_that_names_the_file(tmp_path, read, content, 
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_in_the_place_of_a_file_is_said(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
-        read_json(tmp_path)
-
-
 def test_names_are_in_natural_order(tmp_path):
     for name in ("10.png", "2.png", "01.png", "a10.png", "a9.png", ".3.png", "4.txt"):
         (tmp_path / name).touch()
@@ -104,16 +99,18 @@ def test_names_are_in_natural_order(tmp_path):
 
 
 @pytest.mark.parametrize("read", [read_json, read_arrays, read_image, read_cloud, read_depth])
-@pytest.mark.parametrize("kind", ["pipe", "device", "long name"])
+@pytest.mark.parametrize("kind", ["pipe", "device", "long name", "folder"])
 def test_what_is_no_file_is_one_line(tmp_path, read, kind):
     suffix = ".ply" if read is read_cloud else ".png"
     path = tmp_path / (300 * "x" if kind == "long name" else "a")
     path = path.with_name(path.name + suffix)
     if kind == "pipe":
         os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
     elif kind == "device":
         path.symlink_to("/dev/zero")
-    with pytest.raises(InputError, match=r"is a pipe or a device|cannot be read"):
+    with pytest.raises(InputError, match=r"is a pipe or a device|cannot be read|is a directory"):
         read(path)
 
 

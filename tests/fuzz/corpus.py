@@ -40,8 +40,6 @@ from mplicits.pipelines.training.folder import RECORD_FILE, load_state, read_rec
 from mplicits.pipelines.training.settings import FitConfig
 from mutate import damaged, damaged_json
 
-__all__ = ["Specimen", "specimens"]
-
 Damage = Callable[[bytes, random.Random], bytes]
 
 # And two points more, for there must be ten at least to be a cloud.

@@ -30,8 +30,6 @@ from typing import NamedTuple
 from corpus import Specimen, specimens
 from mplicits.neural_fields import InputError
 
-__all__ = ["BAD", "Outcome", "case", "hunt"]
-
 SECONDS = 20
 IDLE = 10  # times as long where nothing is done
 SPARE = 256 << 20  # bytes that reading may take, beside three times the file

@@ -9,8 +9,6 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["damaged", "damaged_json"]
-
 NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 WORDS = (
     *(b"0", b"-1", b"2147483647", b"-2147483648", b"4294967295", b"9223372036854775807", b"1" + b"0" * 30),

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ....neural_fields import InputError, Similarity
-from ..point_cloud import PointCloud, centred, middle_of, unit_rows, usable_rows
-from ..readers.meshes import weld
+from ..point_cloud import PointCloud, centred, middle_of, unit_rows, usable_rows, weld
 from ..readers.reading import MIN_POINTS
 from .judging import layer_level, neighborly, worse_normals
 from .noise import noise_deviation, noise_level, smooth_along_normals

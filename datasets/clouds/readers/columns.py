@@ -24,7 +24,6 @@ class Layout(NamedTuple):
     points: Triple  # numbers of the columns x, y, z
     normals: Triple | None = None
     colors: Triple | None = None
-    guessed: bool = False  # whether the values decided, since there are no names
 
 
 class RawRows(NamedTuple):
@@ -149,7 +148,7 @@ def _guessed(table: Table, *, scanner: bool) -> Layout:
     if len(best) != 1:
         why = "can be read in several ways" if best else "are neither unit normals nor colours"
         raise _unclear(table, f"without names, columns 4 to {width} {why}")
-    return Layout((0, 1, 2), best[0].normals, best[0].colors, guessed=True)
+    return Layout((0, 1, 2), best[0].normals, best[0].colors)
 
 
 def _unclear(table: Table, why: str) -> InputError:

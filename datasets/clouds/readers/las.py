@@ -80,7 +80,7 @@ class _Choice:
         if self.drop_noise:
             kept &= ~self._is_noise(part)
         layout = self._layout()
-        used = {k for which in layout[:3] if which is not None for k in which}
+        used = {k for which in layout if which is not None for k in which}
         columns = [np.asarray(part[name])[kept] if k in used else np.empty(0) for k, name in enumerate(self.names)]
         return Table(self.path, columns).rows(layout)
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....neural_fields import InputError
-from ..point_cloud import PointCloud, colors_from, unit_rows
+from ..point_cloud import PointCloud, colors_from, unit_rows, weld
 from .columns import Table, choose_layout, cloud_from
 from .tables import numbers
 
@@ -85,34 +85,6 @@ def as_mesh(cloud: PointCloud, faces: Int64) -> PointCloud:
     reading = f"{cloud.reading}; normals from {len(faces):,} triangles"
     normals = vertex_normals(cloud.points, faces)
     return dataclasses.replace(cloud, normals=normals, normals_source="mesh", reading=reading)
-
-
-def weld(vertices: Float64) -> tuple[Int64, Int64]:
-    """The first of each set of equal rows of ``vertices`` ``(N, K)``: indices ``(M,)``, rows in ascending order.
-
-    The second result is the place of each old row among them ``(N,)``.
-    """
-    order = np.lexsort((vertices + 0.0).T)  # stable: among equals the first comes first; + 0.0: minus zero is zero
-    ordered = vertices[order]
-    first = np.ones(len(vertices), bool)
-    first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
-    index = np.empty(len(vertices), np.int64)
-    index[order] = np.cumsum(first) - 1
-    return order[first], index
-
-
-def spread_on_faces(areas: Float64, count: int, rng: np.random.Generator) -> tuple[Int64, Float64]:
-    """Places uniform by area: their faces ``(count,)``, ascending, and weights ``(count, 3)`` of the faces' corners.
-
-    ``areas`` are ``(F,)`` of the faces, or numbers in proportion to them.
-    """
-    total = np.cumsum(areas)
-    if not total[-1] > 0:
-        raise ValueError("surface: all of its faces have zero area")
-    face = np.searchsorted(total, rng.uniform(0, total[-1], count), side="right").clip(max=len(total) - 1)
-    face = np.sort(face)  # neighbours in memory are then neighbours in space, which k-d trees like
-    root, second = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
-    return face, np.stack((1 - root, root * (1 - second), root * second), axis=1)
 
 
 def triangulate(lengths: Int64, corners: Int64) -> Int64:

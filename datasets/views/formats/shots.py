@@ -69,7 +69,7 @@ def list_images(folder: Path) -> list[Path]:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height, from the header alone."""
-    import imageio.v3 as iio  # here, because most files of cameras say it themselves
+    import imageio.v3 as iio  # here, because most files of cameras hold the size
 
     try:
         shape = iio.improps(path, plugin="pillow").shape

@@ -78,7 +78,7 @@ def _shot(frame: _Frame) -> Shot:
         raise InputError(f"{frame.named('file_path')}: None; expected the name of the image")
     folder = frame.path.parent
     image = _image(folder, name)
-    # nerfstudio's name of the key, and instant-ngp's, which says how much a step of an integer is.
+    # The keys of nerfstudio, and of instant-ngp, which also gives the size of an integer step.
     depth = _file_name(frame, "depth_file_path") or _file_name(frame, "depth_path")
     step = None if depth is None else frame.positive("integer_depth_scale")
     return Shot(

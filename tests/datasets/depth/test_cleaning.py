@@ -7,11 +7,9 @@ from mplicits.datasets.depth.cleaning import joint_bilateral, smooth_depth
 
 
 def table_bound(guide: np.ndarray, image: np.ndarray, size: int) -> float:
-    """How far OpenCV may be from the exact filter.
+    """A bound of OpenCV's error: h²/8 in each weight of interpolating exp(-t²/2) in a table of 4096 entries a channel.
 
-    It looks exp(-t²/2), whose second derivative is at most 1, up in a table of 4096 entries per channel, interpolating:
-    h²/8 in each weight, beside float32's rounding. A mean changes by less than twice the changes of its weights, times
-    the largest value, over the sum of the weights, which is at least 1, the centre's own.
+    A mean changes by less than twice the changes of its weights, times the largest value; the weights sum to 1 or more.
     """
     step = float(np.ptp(guide, axis=(0, 1)).sum()) / (4096 * guide.shape[2])
     weight = step**2 / 8 + 16 * float(np.finfo(np.float32).eps)

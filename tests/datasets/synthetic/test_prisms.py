@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from mplicits.datasets.synthetic.prisms import PRISMS, TURN, box, cylinder, gear, prism
+from mplicits.datasets.synthetic.prisms import PRISMS, TURN, box, cylinder, gear
 from mplicits.pipelines.cli.entry import SOLIDS
 
 
@@ -39,5 +39,3 @@ def test_all_of_them_fit_into_the_mesher_and_lie_along_no_axis() -> None:
         assert np.abs(vertices).max() < 1
         ends = trimesh.Trimesh(vertices, faces, process=False).face_normals[len(faces) // 2 :]
         assert np.abs(ends).max() < 0.9
-    with pytest.raises(ValueError):  # noqa: PT011  numpy's own
-        prism(np.zeros(3), 1.0)

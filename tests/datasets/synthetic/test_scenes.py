@@ -129,15 +129,6 @@ def test_gloss_is_the_mirror_image_of_the_lamp(sphere):
         assert (lit_too >= shade - 1e-6).all()
 
 
-def test_the_mask_has_the_area_of_the_projected_sphere(sphere):
-    """A sphere seen along the axis is a disc of radius f r / √(d² − r²)."""
-    images = render_scene(sphere, 5, 48, seed=3)
-    for view in images.views:
-        distance = float(view.camera.eye.norm())
-        radius = float(view.camera.intrinsics[0, 0]) * 0.6 / math.sqrt(distance**2 - 0.36)
-        assert view.mask.sum() == pytest.approx(math.pi * radius**2, rel=2e-3)
-
-
 def test_a_box_covers_a_square_with_even_edges():
     """Its near face alone is seen: f·2a/(d − a) pixels wide, of which the outermost ones are covered by shares."""
     scene = Scene("box", Box(half_size=(0.3, 0.3, 0.3)), lambda points: np.ones_like(points), radius=0.55)

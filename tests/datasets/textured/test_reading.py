@@ -1,10 +1,8 @@
 import base64
 import json
 import math
-import os
 import struct
 
-import cv2
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -47,9 +45,6 @@ def at(mesh, x, y):
     return colors_at(mesh, face, weights)
 
 
-# Colour space
-
-
 @pytest.mark.parametrize("kind", [np.float32, np.float64, torch.float32, torch.float64])
 def test_color_space_has_its_known_values(kind):
     display = [0.0, 0.04045, 0.5, 188 / 255, 1.0]
@@ -69,9 +64,6 @@ def test_color_space_goes_there_and_back_and_has_gradients():
         assert torch.autograd.gradcheck(curve, t[1:])
         (gradient,) = torch.autograd.grad(curve(t).sum(), t)
         assert torch.isfinite(gradient).all()
-
-
-# Lookup
 
 
 def test_centres_of_texels_are_half_a_texel_in():
@@ -110,10 +102,7 @@ def test_lookup_is_bilinear_in_light():
     image = rng.uniform(size=(7, 5, 3)).astype(np.float32)
     uv = rng.uniform(0.2, 0.8, (100, 2))
     column, row = uv[:, 0] * 5 - 0.5, (1 - uv[:, 1]) * 7 - 0.5
-    place = np.stack((column, row), axis=1).astype(np.float32)
     light = srgb_to_linear(image)
-    exact = cv2.remap(light, place[None, :, 0], place[None, :, 1], cv2.INTER_LINEAR)[0]
-    np.testing.assert_allclose(lookup(image, uv), exact, atol=0.02)  # OpenCV keeps 5 bits of the shares
     j, i = np.floor(column).astype(int), np.floor(row).astype(int)
     a, b = (column - j)[:, None], (row - i)[:, None]
     above, below = (light[i + k, j] * (1 - a) + light[i + k, j + 1] * a for k in (0, 1))
@@ -127,9 +116,6 @@ def test_vertex_colours_are_interpolated_in_light_and_multiply_the_image():
     np.testing.assert_allclose(at(plain, 0.5, 0.5), [(1, half, half)], atol=1e-6)
     both = TexturedMesh(SQUARE, FACES, UV, np.full((1, 1, 3), half, np.float32), shades)
     np.testing.assert_allclose(at(both, 0.5, 0.0), [(half, 0, 0)], atol=1e-6)
-
-
-# OBJ
 
 
 def write_obj(folder, *, mtl="newmtl paint\nmap_Kd paint.png\n", faces="f 1/1 2/2 3/3 4/4", head="mtllib square.mtl\n"):
@@ -222,9 +208,6 @@ def test_bad_obj_is_one_line(tmp_path, change, message):
     assert "\n" not in str(error.value)
 
 
-# GLB and glTF
-
-
 def gltf(*, image=None, factor=None, colors=None, node=None, sampler=None, transform=None, indices=FACES, mode=4):
     """The square in glTF, its buffer within; every triangle has vertices of its own, as at seams."""
     corners = SQUARE[FACES].reshape(-1, 3)
@@ -240,23 +223,18 @@ def gltf(*, image=None, factor=None, colors=None, node=None, sampler=None, trans
     if factor is not None:
         material["baseColorFactor"] = [*factor, 1.0]
     if image is not None:
-        material["baseColorTexture"] = {"index": 0} | (
-            {"extensions": {"KHR_texture_transform": transform}} if transform else {}
-        )
+        extensions = {"extensions": {"KHR_texture_transform": transform}} if transform else {}
+        material["baseColorTexture"] = {"index": 0} | extensions
         blobs.append(iio.imwrite("<bytes>", np.rint(image * 255).astype(np.uint8), extension=".png"))
     starts = np.cumsum([0, *((len(blob) + 3) // 4 * 4 for blob in blobs)]).tolist()
     body = b"".join(blob + bytes(-len(blob) % 4) for blob in blobs)
+    views = [{"buffer": 0, "byteOffset": at, "byteLength": len(blob)} for at, blob in zip(starts, blobs, strict=False)]
     kinds = {"<f4": 5126, "<u2": 5123, "|u1": 5121}
-    accessors = [
-        {
-            "bufferView": k,
-            "componentType": kinds[array.dtype.str],
-            "count": len(array),
-            "type": {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}[array.shape[1] if array.ndim == 2 else 1],
-            "normalized": k == 3 and array.dtype != np.float32,
-        }
-        for k, array in enumerate(arrays)
-    ]
+    accessors = []
+    for k, array in enumerate(arrays):
+        form = ("SCALAR", "VEC2", "VEC3", "VEC4")[array[0].size - 1]
+        accessor = {"bufferView": k, "componentType": kinds[array.dtype.str], "count": len(array), "type": form}
+        accessors.append(accessor | {"normalized": k == 3 and array.dtype != np.float32})
     header = {
         "asset": {"version": "2.0"},
         "scene": 0,
@@ -266,10 +244,7 @@ def gltf(*, image=None, factor=None, colors=None, node=None, sampler=None, trans
         "materials": [{"pbrMetallicRoughness": material}],
         "accessors": accessors,
         "buffers": [{"byteLength": len(body)}],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": start, "byteLength": len(blob)}
-            for start, blob in zip(starts, blobs, strict=False)
-        ],
+        "bufferViews": views,
         "textures": [{"source": 0} | ({"sampler": 0} if sampler else {})],
         "samplers": [sampler] if sampler else [],
         "images": [{"bufferView": len(blobs) - 1}],
@@ -361,10 +336,7 @@ def test_gltf_textures_wrap_and_move_as_they_say(tmp_path):
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
-        (
-            lambda h: h.update(extensionsRequired=["KHR_draco_mesh_compression"]),
-            "KHR_draco_mesh_compression is not read",
-        ),
+        (lambda h: h.update(extensionsRequired=["KHR_draco_mesh_compression"]), "compression is not read"),
         (lambda h: h["images"].__setitem__(0, {"uri": "gone.png"}), r"images\[0\]: .*gone\.png is not there"),
         (lambda h: h["images"].__setitem__(0, {"bufferView": 0}), r"images\[0\]: not an image that can be read"),
         (lambda h: h["nodes"][0].update(children=[0]), "its own ancestor"),
@@ -374,10 +346,7 @@ def test_gltf_textures_wrap_and_move_as_they_say(tmp_path):
         (lambda h: h["bufferViews"][3].update(byteLength=10**6), "goes beyond the"),
         (lambda h: h["nodes"][0].update(matrix=[math.nan] * 16), "matrix has a number that is not finite"),
         (lambda h: h["nodes"][0].update(scale=[math.inf, 1, 1]), "scale has a number that is not finite"),
-        (
-            lambda h: h["materials"][0]["pbrMetallicRoughness"].update(baseColorFactor=[math.nan, 1, 1, 1]),
-            "baseColorFactor has a number that is not finite",
-        ),
+        (lambda h: h["materials"][0]["pbrMetallicRoughness"].update(baseColorFactor=[math.nan] * 4), "baseColorFactor"),
         (lambda h: h["accessors"][0].update(count=2), "a face names vertex 5, but there are only 2"),
         (lambda h: h["meshes"][0]["primitives"][0].update(mode=1), "no triangles in it"),
         (lambda h: h["materials"][0].clear(), "neither a texture nor vertex colours"),
@@ -409,19 +378,6 @@ def test_damaged_numbers_and_a_cut_glb_are_one_line(tmp_path):
                 read(path)
             assert "\n" not in str(error.value)
             assert "square.glb" in str(error.value)
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
-def test_a_pipe_in_place_of_an_mtl_file_is_not_waited_for(tmp_path):
-    write_png(tmp_path / "paint.png", QUARTERS)
-    path = write_obj(tmp_path)
-    (tmp_path / "square.mtl").unlink()
-    os.mkfifo(tmp_path / "square.mtl")
-    with pytest.raises(InputError, match=r"square\.mtl is not there"):
-        read_textured(path)
-
-
-# PLY, and what is common
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])

@@ -97,16 +97,10 @@ def test_every_model_gives_its_cameras_in_the_order_of_names(model, write, tmp_p
 
 
 @pytest.mark.parametrize("write", WRITERS)
-def test_points_keep_all_their_digits(write, tmp_path):
+def test_points_keep_all_their_digits_and_say_which_images_saw_them(write, tmp_path):
     found = read_colmap_points(write(tmp_path))
     assert found is not None
     np.testing.assert_array_equal(found[0], POINTS)
-
-
-@pytest.mark.parametrize("write", WRITERS)
-def test_points_say_which_images_saw_them(write, tmp_path):
-    found = read_colmap_points(write(tmp_path))
-    assert found is not None
     # Images 5, 6 and 7 are b, a and c, whose order by name is a, b, c. The text says 5 and 6 of every point, the binary
     # file 5 of the second and twice of the third.
     expected = [[1, 0], [0, 0], [1, 1], [0, 1], [1, 2], [0, 2]] if write is write_text else [[1, 1], [1, 2], [1, 2]]

@@ -155,10 +155,7 @@ def without(key: str) -> dict:
         (frame_change(cx="middle"), r"frames\[1\]\.cx: 'middle'; expected a finite number"),
         (transforms(**SIZE, camera_angle_x=4), r"camera_angle_x: 4; expected radians"),
         (frame_change(w=40.5), r"frames\[1\]\.w: 40\.5; expected whole pixels"),
-        (
-            transforms(**FOCAL, **SIZE, camera_model="OPENCV_FISHEYE"),
-            "json: camera_model: 'OPENCV_FISHEYE': no",
-        ),
+        (transforms(**FOCAL, **SIZE, camera_model="OPENCV_FISHEYE"), "json: camera_model: 'OPENCV_FISHEYE': no"),
         (transforms(**FOCAL, **SIZE, is_fisheye=True), "is_fisheye: True: no pinhole; undistort"),
     ],
 )

@@ -2,7 +2,6 @@
 
 import math
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -150,24 +149,21 @@ def test_the_sharpest_frames_of_a_film_are_taken(tmp_path: Path, solved: list[di
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("name", "content", "message"),
     [
-        (lambda path: None, "no such file or folder"),
-        (lambda path: path.mkdir(), "0 photographs"),
-        (lambda path: path.write_bytes(b"x"), "neither a folder of photographs nor a film"),
+        ("none", None, "no such file or folder"),
+        ("folder", "", "0 photographs"),
+        ("source", "x", "neither a folder of photographs nor a film"),
+        ("film.mp4", "no film", r"film\.mp4: not a film that can be read"),
     ],
 )
-def test_sources_that_are_none(tmp_path: Path, solved: Any, make: Callable[[Path], None], message: str) -> None:
-    make(tmp_path / "source")
+def test_sources_that_are_none(tmp_path: Path, solved: Any, name: str, content: str | None, message: str) -> None:
+    if content:
+        (tmp_path / name).write_text(content)
+    elif content is not None:
+        (tmp_path / name).mkdir()
     with pytest.raises(InputError, match=message):
-        find_cameras(tmp_path / "source", tmp_path / "project")
-    assert not (tmp_path / "project").exists()
-
-
-def test_a_film_that_is_none(tmp_path: Path, solved: Any) -> None:
-    (tmp_path / "film.mp4").write_bytes(b"not a film")
-    with pytest.raises(InputError, match=r"film\.mp4: not a film that can be read"):
-        find_cameras(tmp_path / "film.mp4", tmp_path / "project")
+        find_cameras(tmp_path / name, tmp_path / "project")
 
 
 def test_folders_of_others_are_left_alone(photographs: Path, tmp_path: Path, solved: Any) -> None:
