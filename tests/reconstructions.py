@@ -5,9 +5,9 @@ from functools import partial
 
 import pytest
 from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.pipelines.reconstruct import hull
+from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct import train as reconstruct_texture
-from mplicits.pipelines.reconstruct.initialisation import hull
-from mplicits.pipelines.reconstruct.model import model as scene_model
 from mplicits.pipelines.training.settings import ReconstructConfig, TextureConfig
 
 # Two levels that take no time, for a few steps on a few rays.

@@ -44,8 +44,7 @@ from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit.unoriented import SIGNING, give_signs
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.training.config import load_config
-from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig, load_config
 from reconstructions import small_reconstructions
 from test_commands import EVOLVE, FIT, RECONSTRUCT, TEXTURE
 from torch import Tensor, nn

@@ -23,7 +23,7 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "mesh.obj": lambda path: write_mesh(path, extract_mesh(Sphere(radius=0.5), resolution=8)),
     "picture.jpg": lambda path: write_picture(path, np.zeros((9, 8, 3), np.uint8)),
     "picture.png": lambda path: write_picture(path, np.zeros((9, 8, 3), np.uint8)),
-    "state.safetensors": lambda path: save_state(path.parent, {}, {"step": 1}, name=path.name),
+    "state.safetensors": lambda path: save_state(path, {}, {"step": 1}),
     "text.txt": lambda path: write_whole(path, "text\r\n"),
 }
 

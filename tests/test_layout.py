@@ -362,6 +362,6 @@ def test_every_training_returns_a_run(tmp_path: Path) -> None:
     assert issubclass(kind, mplicits.Run)
     field = mplicits.Sphere(radius=0.5)
     run = mplicits.Run(field, mplicits.Similarity((1.0, 0.0, 0.0), 4.0), tmp_path, {})
-    assert run.folder == tmp_path
+    assert run.directory == tmp_path
     assert float(run.shape().distance(np.array([4.0, 0.0, 0.0]))) == pytest.approx(1.0)
     assert run.mesh(16).vertices[:, 0].mean() == pytest.approx(1.0, abs=0.1)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mplicits.pipelines.cli.common import add_flags, positive, whole, write_json
-from mplicits.pipelines.training.config import input_error
+from mplicits.pipelines.training.settings import input_error
 
 if TYPE_CHECKING:
     from ..harness.benchmark import Benchmark
@@ -35,7 +35,7 @@ def run_benches(
         out: folder of the results; None keeps nothing.
         streams: cells at a time, see `run_streams`.
     """
-    from mplicits.pipelines.training.lock import locked
+    from mplicits.pipelines.training.folder import locked
     from mplicits.pipelines.training.progress import progress_bars
     from mplicits.pipelines.training.trainer import Interrupted
 

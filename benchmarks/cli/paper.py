@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from mplicits.pipelines.cli.common import Command, add_flags, check_output, whole, write_json
-from mplicits.pipelines.training.config import closest, input_error
+from mplicits.pipelines.training.settings import closest, input_error
 
 from ..paper.names import METHODS, PRESETS, TABLES
 from .common import typed
@@ -49,7 +49,7 @@ def _paper(arguments: argparse.Namespace) -> int:
     tables = TABLES if "all" in asked else _known("--table", asked, TABLES, more=("all",))
     methods = METHODS if arguments.methods is None else _known("--methods", _words(arguments.methods), METHODS)
     (preset,) = _known("--preset", [arguments.preset], PRESETS)
-    from mplicits.pipelines.training.lock import locked
+    from mplicits.pipelines.training.folder import locked
     from mplicits.pipelines.training.trainer import Interrupted
 
     from ..harness.cells import make_folder

@@ -9,8 +9,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from mplicits.pipelines.cli.common import Command, add_flags, add_settings, positive, read_settings, whole
-from mplicits.pipelines.training.config import given_flags, input_error, load_config
-from mplicits.pipelines.training.settings import EvolveConfig, ReconstructConfig
+from mplicits.pipelines.training.settings import EvolveConfig, ReconstructConfig, given_flags, input_error, load_config
 
 from .common import folder_flag, measured_flags, number, run_benches
 

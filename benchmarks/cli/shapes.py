@@ -9,8 +9,15 @@ from pathlib import Path
 from types import MappingProxyType
 
 from mplicits.pipelines.cli.common import Command, add_flags, add_settings, check_output, positive, read_settings, whole
-from mplicits.pipelines.training.config import add_config_flags, given_flags, input_error, load_config, preset_names
-from mplicits.pipelines.training.settings import FitConfig, TextureConfig
+from mplicits.pipelines.training.settings import (
+    FitConfig,
+    TextureConfig,
+    add_config_flags,
+    given_flags,
+    input_error,
+    load_config,
+    preset_names,
+)
 
 from .common import folder_flag, measured_flags, noise_of, noisy_flags, number, run_benches, view_flags
 

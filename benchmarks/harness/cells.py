@@ -17,7 +17,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from mplicits.neural_fields import InputError
 from mplicits.neural_fields.backend.files import write_json
-from mplicits.pipelines.training.config import closest
+from mplicits.pipelines.training.settings import closest
 from mplicits.pipelines.training.trainer import Progress, Report
 
 # What a cell found, as it stands in its JSON file; see `benchmarks.harness.run.run_cell`.

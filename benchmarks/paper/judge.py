@@ -20,8 +20,7 @@ from mplicits.pipelines.render.picture import write_picture
 from mplicits.pipelines.render.rasterise import picture_of
 from mplicits.pipelines.surface.measure import evaluate_surfaces
 from mplicits.pipelines.surface.surface import Support, drop_unsupported, read_reference
-from mplicits.pipelines.training.config import load_config
-from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig, load_config
 
 from ..harness.cells import Workplace
 from .cells import PaperCell, Preset

@@ -26,9 +26,8 @@ import torch
 from mplicits.neural_fields import Field, Jet
 from mplicits.neural_fields.networks.multiscale import levels_of
 from mplicits.neural_fields.networks.radiance import Outside, ViewColor
-from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel
-from mplicits.pipelines.reconstruct.model.objective import SceneObjective
-from mplicits.pipelines.reconstruct.model.replayed import ReplayedTrainer, scene_trainer
+from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
+from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective, scene_trainer
 from mplicits.pipelines.training.replay import Recorder, Results, Work
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import Progress, StopFlag, Trainer

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
-from mplicits.pipelines.reconstruct.model.model import SceneModel, build_scene
+from mplicits.pipelines.reconstruct.model import SceneModel, build_scene
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import seeded
 from scipy.special import stdtrit

@@ -18,15 +18,14 @@ from mplicits.neural_fields import InputError, Mesh, NoSurfaceError
 from mplicits.neural_fields.meshing.extract import extract_mesh
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel, build_scene
+from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.views import ViewImage, comparison_sheet, held_out, measure, render_image
 from mplicits.pipelines.render.picture import Image, contact_sheet, write_picture
 from mplicits.pipelines.surface.measure import Metrics, evaluate_surfaces
 from mplicits.pipelines.surface.surface import in_region, keep_largest
-from mplicits.pipelines.training.config import closest
 from mplicits.pipelines.training.folder import digest_of
 from mplicits.pipelines.training.machine import choose_device, environment
-from mplicits.pipelines.training.settings import ReconstructConfig
+from mplicits.pipelines.training.settings import ReconstructConfig, closest
 from mplicits.pipelines.training.trainer import Interrupted, Progress, parameter_count, stop_on_signals
 
 from ..harness.benchmark import Benchmark, Part, network_name, one_of_each, plain

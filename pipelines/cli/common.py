@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from ..training.config import add_config_flags, closest, given_flags, input_error, load_config, preset_names, thing_of
+from ..training.settings import add_config_flags, closest, given_flags, input_error, load_config, preset_names, thing_of
 
 if TYPE_CHECKING:
-    from ..training.report import Progress, Report
+    from ..training.progress import Progress, Report
 
 # How often an idle thread of GNU's OpenMP, which PyTorch uses on Linux, looks for its next share of work before it
 # sleeps: 0.2 ms rather than several. Meanwhile it holds a core that another process, or a thread with blocks of its
@@ -72,7 +72,7 @@ def training(
         stack.enter_context(stoppable(kept, at_any_time=at_any_time))
         listeners: list[Report] = []
         if board is not None:
-            from ..training.tensorboard import tensorboard_log
+            from ..training.progress import tensorboard_log
 
             listeners.append(stack.enter_context(tensorboard_log(board)))
         if not quiet:

@@ -26,8 +26,7 @@ from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import trace_view
 from ..surface.surface import from_cloud
 from ..training.machine import format_table
-from ..training.progress import progress_bars
-from ..training.report import Progress, Report, reported
+from ..training.progress import Progress, Report, progress_bars, reported
 from ..training.settings import FitConfig
 from .common import tell_budget
 

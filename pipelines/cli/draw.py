@@ -11,8 +11,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from ..training.config import add_config_flags, given_flags, input_error, load_config
-from ..training.settings import SHADINGS, ShadeOptions
+from ..training.settings import SHADINGS, ShadeOptions, add_config_flags, given_flags, input_error, load_config
 from .common import Command, add_flags, between, check_output, finite, refuse, whole
 
 PICTURES = (".png", ".jpg", ".jpeg")

@@ -11,8 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from ..training.config import command_line, given_flags, input_error
-from ..training.settings import FitConfig
+from ..training.settings import FitConfig, command_line, given_flags, input_error
 from .common import Command, Program, add_flags, add_settings, between, check_output, read_settings, refuse
 from .draw import ANIMATE, RENDER, SLICE, VIEW
 from .fit import FIT, describe

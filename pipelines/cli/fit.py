@@ -11,8 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..training.config import command_line, given_flags, input_error
-from ..training.settings import FitConfig
+from ..training.settings import FitConfig, command_line, given_flags, input_error
 from .common import (
     Command,
     add_new_run,

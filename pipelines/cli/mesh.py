@@ -8,7 +8,7 @@ import functools
 import time
 from typing import TYPE_CHECKING
 
-from ..training.config import given_flags
+from ..training.settings import given_flags
 from .common import Command, add_flags, positive, whole, write_json
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         metrics = evaluate_files(arguments.mesh, arguments.reference, **options)
     else:
         from ...datasets.views.images import read_cameras
-        from ..reconstruct.data.visibility import count_views
+        from ..reconstruct.views import count_views
         from ..training.progress import counter_bar
 
         cameras = [camera for _, camera in read_cameras(arguments.photos)]

@@ -7,8 +7,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..training.config import command_line, given_flags, input_error, load_config
-from ..training.settings import EvolveConfig, FitConfig, ReconstructConfig, TextureConfig
+from ..training.settings import (
+    EvolveConfig,
+    FitConfig,
+    ReconstructConfig,
+    TextureConfig,
+    command_line,
+    given_flags,
+    input_error,
+    load_config,
+)
 from .common import (
     Command,
     Stopped,
@@ -133,10 +141,10 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     config = new_settings(arguments, ReconstructConfig)
     from ...datasets.views.poses.find_cameras import find_cameras
     from ..mesh.extract import mesh_run
-    from ..reconstruct.posing import colmap_report
+    from ..reconstruct.check import colmap_report
     from ..reconstruct.train import HELD_OUT_FILE, MESH_FILE, reconstruct
     from ..training.folder import check_new_run
-    from ..training.report import reported
+    from ..training.progress import reported
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     data = arguments.data
@@ -173,7 +181,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
 
 def _tell_left_out(record: dict[str, Any]) -> None:
     """Warn, on stderr, of photographs, and parts of them, that were not trained on."""
-    from ..reconstruct.data.silhouettes import named
+    from ..reconstruct.silhouettes import named
 
     odd, torn = record.get("left_out", []), record.get("mask_holes", {})
     trained = record["views"]["trained"]

@@ -9,8 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args, get_type_hints
 
-from ..training.config import command_line, input_error
-from ..training.settings import ReconstructConfig
+from ..training.settings import ReconstructConfig, command_line, input_error
 from .common import Command, add_flags, check_output, positive, refuse, training, whole, write_json
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ def _find_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _find_cameras(arguments: argparse.Namespace) -> int:
     from ...datasets.views.poses.find_cameras import find_cameras
-    from ..reconstruct.posing import colmap_report
+    from ..reconstruct.check import colmap_report
 
     out = arguments.out
     with training("the same command continues", quiet=arguments.quiet, at_any_time=True) as report:
@@ -44,7 +43,7 @@ def _find_cameras(arguments: argparse.Namespace) -> int:
 
 def tell_found(found: FoundCameras | FoundPoints) -> None:
     """Print what was found, and warn on stderr."""
-    from ..reconstruct.posing import said_of
+    from ..reconstruct.check import said_of
 
     line, warnings = said_of(found)
     print(line)
@@ -73,7 +72,7 @@ def _points_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _find_points(arguments: argparse.Namespace) -> int:
     from ...datasets.views.poses.find_points import find_points
-    from ..reconstruct.posing import colmap_report
+    from ..reconstruct.check import colmap_report
 
     out = arguments.out
     with training("the same command continues", quiet=arguments.quiet, at_any_time=True) as report:
@@ -117,7 +116,7 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
 def _check_cameras(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".glb", ".ply"))
     from ...datasets.views.formats.shots import DepthSource
-    from ..reconstruct.checks.check import check_files
+    from ..reconstruct.check import check_files
 
     depths = DepthSource(arguments.depth_maps, arguments.depth_kind, arguments.depth_scale)
     _, check, text = check_files(arguments.data, arguments.out, depths, allow_missing=arguments.allow_missing)

@@ -6,7 +6,7 @@ import argparse
 import time
 from pathlib import Path
 
-from ..training.config import given_flags, input_error
+from ..training.settings import given_flags, input_error
 from .common import Command, add_flags, check_output, stoppable, whole
 
 PAGES = (".html", ".htm")

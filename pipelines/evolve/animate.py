@@ -26,13 +26,10 @@ from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.trace import PRECISION, fine_strips, pixel_size, see_hits
 from ..texture.transport import Colors, TransportedColors, borrowed_texture, pinned_texture, start_texture
-from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, read_record
+from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, load_motion, read_record
 from ..training.machine import choose_device
-from ..training.motion import load_motion
 from .follow import follow_mesh
 from .shapes import Placement as ShapePlacement
-
-__all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames", "last_colors", "there_and_back"]
 
 Tell = Callable[[int, int], None]
 
@@ -41,41 +38,22 @@ SHEET = ".png"
 
 @dataclass(frozen=True)
 class SequenceOptions:
-    """What is written, and how.
+    """What is written, and how."""
 
-    Attributes:
-        frames: times from 0 to 1, both among them.
-        fps: frames per second.
-        size: width and height of a film.
-        level: counted from 0; None is the finest.
-        resolution: of meshes, in cells along the cube.
-        colors: a run that does not move, the first shape's, whose texture is the surface's at time 0; None is the
-            run's own, if it has one.
-        last_colors: the last shape's run, whose texture fades in on the way; of runs that go from shape to shape.
-        no_colors: leave colours out.
-        orbit: where the camera of a film stands.
-        shading: of a film.
-        shadows: whether lambert has shadows and occlusion.
-        samples: rays per pixel and direction.
-        ease: begin and end at rest: frames are evenly spaced in s, and show the time s² (3 − 2 s).
-        loop: of films, play there and back; each frame but both ends is shown twice, and traced once.
-        device: where to evaluate the field, "auto" is CUDA where there is one.
-    """
-
-    frames: int = 48
-    fps: float = 24.0
-    size: tuple[int, int] = (640, 640)
-    level: int | None = None
-    resolution: int = 128
-    colors: str | Path | None = None
-    last_colors: str | Path | None = None
-    no_colors: bool = False
-    orbit: Orbit = dataclasses.field(default_factory=Orbit)
-    shading: str = "lambert"
-    shadows: bool = False
-    samples: int = 2
-    ease: bool = False
-    loop: bool = False
+    frames: int = 48  # times from 0 to 1, both among them
+    fps: float = 24.0  # frames per second
+    size: tuple[int, int] = (640, 640)  # width and height of a film
+    level: int | None = None  # counted from 0; None is the finest
+    resolution: int = 128  # of meshes, in cells along the cube
+    colors: str | Path | None = None  # run of the first shape, for its texture at time 0; None: the run's own
+    last_colors: str | Path | None = None  # run of the last shape, whose texture fades in on the way
+    no_colors: bool = False  # leave colours out
+    orbit: Orbit = dataclasses.field(default_factory=Orbit)  # where the camera of a film stands
+    shading: str = "lambert"  # of a film
+    shadows: bool = False  # whether lambert has shadows and occlusion
+    samples: int = 2  # rays per pixel and direction
+    ease: bool = False  # begin and end at rest: frames are evenly spaced in s, at the times s² (3 − 2 s)
+    loop: bool = False  # films play there and back, each frame traced once
     device: str = "auto"
 
     @property
@@ -86,11 +64,10 @@ class SequenceOptions:
 
 
 def check_sequence_path(path: str | Path) -> Path:
-    """Whether a sequence can be written to ``path``, to be asked before any long work.
+    """The path of a sequence, if it can be written there.
 
     Raises:
-        InputError: it is a file of another kind, it cannot come to be there (`check_place`), or it is a folder that is
-            not empty.
+        InputError: it is a file of another kind, it cannot come to be there, or it is a folder that is not empty.
     """
     path = Path(path)
     if path.suffix and path.suffix.lower() not in (*ANIMATIONS, SHEET, ".glb"):
@@ -107,17 +84,10 @@ def check_sequence_path(path: str | Path) -> Path:
 def animate_run(
     run: str | Path, out: str | Path, options: SequenceOptions | None = None, *, progress: Tell | None = None
 ) -> str:
-    """Write the surface of a run over time.
+    """Write the surface of a run over time → what was written, in a few words.
 
-    Args:
-        run: run directory or .safetensors file, of a field of space-time.
-        out: an .mp4 or .gif film, traced; a .png of all frames side by side; a .glb of one mesh that moves; or a
-            folder, for a .ply per frame.
-        options: what, and how.
-        progress: called with how many frames are done, and of how many.
-
-    Returns:
-        What was written, in a few words.
+    ``out`` is an .mp4 or .gif film, traced; a .png of all frames side by side; a .glb of one mesh that moves; or a
+    folder, for a .ply per frame. ``progress`` is called with how many frames are done, and of how many.
 
     Raises:
         InputError: there is no such run, it does not move or has no such level or no surface; it cannot be one mesh; or

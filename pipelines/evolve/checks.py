@@ -18,28 +18,18 @@ from .problem import End
 from .samples import band_points
 from .topology import Change, Topology, find_changes, surface_of, topology_of
 
-__all__ = ["FrameFigures", "check_evolution", "end_figures", "frame_figures", "slope_figures", "warnings"]
-
 END_RESOLUTION = 192
 
 
 @dataclass(frozen=True)
 class FrameFigures:
-    """The surface at one time.
-
-    Attributes:
-        time: when.
-        volume: inside it, in units of the field; 0 where there is no surface.
-        components: of it.
-        holes: through them.
-        slope_error: mean of ||∇f| − 1| at its vertices; None where there are none.
-    """
+    """The surface at one time."""
 
     time: float
-    volume: float
-    components: int
-    holes: int
-    slope_error: float | None
+    volume: float  # inside it, in units of the field; 0 where there is no surface
+    components: int  # of it
+    holes: int  # through them
+    slope_error: float | None  # mean of ||∇f| − 1| at its vertices; None where there are none
 
     @property
     def topology(self) -> Topology:
@@ -59,14 +49,8 @@ def check_evolution(
 ) -> dict[str, Any]:
     """All figures of a trained field, on the CPU, as ``run.json`` holds them under ``checks``.
 
-    Args:
-        field: four-dimensional.
-        ends: the surfaces that it should have met.
-        similarity: from input coordinates, in which places are given; None: those of the field.
-        frames: at how many times it is meshed.
-        resolution: of those meshes; ends are meshed finer.
-        count: told how many frames, ends and slopes are done, and of how many.
-        until: see `find_changes`.
+    ``frames`` times are meshed at a ``resolution``; ``count`` is told how many of how many are done. After the moment
+    ``until``, by `time.monotonic`, changes of topology are not searched for more closely.
     """
     total = frames + len(ends) + 2
     count = count or (lambda _done, _total: None)
@@ -126,12 +110,7 @@ def slope_figures(field: Field, *, count: int = 20_000, width: float = 0.05) -> 
         return dict.fromkeys(("mean", "low", "high", "mean_error"))
     slope = field.jet(points).gradient[:, :3].norm(dim=1)
     low, high = slope.quantile(torch.tensor([0.05, 0.95])).tolist()
-    return {
-        "mean": float(slope.mean()),
-        "low": low,
-        "high": high,
-        "mean_error": float((slope - 1).abs().mean()),
-    }
+    return {"mean": float(slope.mean()), "low": low, "high": high, "mean_error": float((slope - 1).abs().mean())}
 
 
 def warnings(checks: dict[str, Any]) -> list[str]:

@@ -1,21 +1,15 @@
-"""A morph by a velocity: a motion is learnt that takes each key shape to the next, and carries what lies in between.
+"""A morph by a velocity that takes each key shape to the next, and carries what lies in between.
 
-A level set knows no correspondence, so the morph of `problem` melts a leg here and lets another one condense there.
-Here a velocity v(x, t) is learnt first. Its characteristics φ take points of one shape to where they shall lie on the
-next one,
+A level set knows no correspondence. Here a velocity v(x, t) is learnt first, whose characteristics φ minimise
 
     L = Σ_k |f_{k+1}(φ_{k→k+1}(x))|² over x on S_k, and |f_k(φ_{k+1→k}(x))|² over x on S_{k+1}      both ends are met
       + w(step) Σ |φ(x) − T(x)|²                                                  a guide, which fades
       + l Σ |φ(a) − b|²                                                           landmarks, where there are any
       + α ‖J + Jᵀ‖² / 2 + β (tr J)²                                         as rigid, as even in volume as can be
 
-along all paths. The guide T matches points by entropic optimal transport, of places, normals and what the two fields
-say at steps along the normals (how thick the shape is there, how far the next part); it only has to be about right.
-`CarriedKeyframes` then is the shape at any time, and what the field of space-time learns.
-
-After the velocities of Sang et al. 2025 ("Implicit Neural Surface Deformation with Explicit Velocity Fields", and
-"4Deform"), who learn both together; here the characteristics are taken first, so that both ends are met by construction
-and no loss has to hold in between.
+along all paths. The guide T matches points by entropic optimal transport of places, normals and values nearby.
+`CarriedKeyframes` then is the shape at any time, and what the field of space-time learns. After Sang et al. 2025
+("Implicit Neural Surface Deformation with Explicit Velocity Fields", and "4Deform"), who learn both together.
 """
 
 from __future__ import annotations
@@ -31,79 +25,41 @@ from torch.nn.functional import huber_loss, normalize, pad
 
 from ...neural_fields import Field, at_time, flow
 from ...neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
-from ..training.budget import BUDGET, Budget
-from ..training.report import Report
+from ..training.progress import Report
+from ..training.scaffold import BUDGET, Budget
 from ..training.settings import EvolveConfig
 from ..training.trainer import Group, Objective, Trainer, seeded, warm_cosine
-from .landmarks import Landmarks, nearness, placed_landmarks
 from .samples import Bounds, Known, around, joined, known_at, uniform
-from .shapes import StaticShape
-
-__all__ = [
-    "MOTION",
-    "MotionObjective",
-    "MotionOptions",
-    "carried_samples",
-    "learn_motion",
-    "match",
-    "motion_figures",
-]
+from .shapes import Landmarks, StaticShape, nearness, placed_landmarks
 
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """Numbers of the motion's training; lengths are in units of the field.
+    """Numbers of the motion's training; lengths are in units of the field."""
 
-    Attributes:
-        pool: points of each shape.
-        matched: of them, which the guide has partners for.
-        steps: of the midpoint rule between two keys, while it is learnt.
-        guided: points with a partner, per end and step of the training.
-        loose: others, likewise.
-        regular: places at which the regularity is evaluated, per step.
-        around: how far these are from the paths.
-        fades: share of the steps after which the guide is gone.
-        far: residuals count linearly from here on: what has no partner does not pull at all others.
-        data: weight of the ends.
-        inside: radius that no path should leave.
-        normals: cost of a pair with opposite normals; the squared way is added to it.
-        surroundings: cost of a pair with other surroundings.
-        marked: weight of the squared differences of nearness to landmarks, added up.
-        depths: at which the surroundings are compared, inward and outward.
-        blur: first blur of the optimal transport, squared length.
-        least_blur: the last one.
-        cooling: factor of the blur, per round.
-        rounds: of Sinkhorn's iterations.
-        left: cost of mass without a partner. More than the longest way in the unit sphere, 2²: where it is less, the
-            rear of a shape that has travelled stays behind.
-        newton: steps to f = 0 of points that were carried.
-        share: of a time budget, for learning the motion.
-        rows: points per call.
-    """
-
-    pool: int = 20_000
-    matched: int = 1000
-    steps: int = 8
-    guided: int = 256
-    loose: int = 512
-    regular: int = 1024
-    around: float = 0.05
-    fades: float = 0.6
-    far: float = 0.1
-    data: float = 20.0
-    inside: float = 0.98
-    normals: float = 0.1
-    surroundings: float = 0.06
-    marked: float = 4.0
-    depths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3)
-    blur: float = 0.1
-    least_blur: float = 0.003
-    cooling: float = 0.93
-    rounds: int = 100
-    left: float = 5.0
-    newton: int = 2
-    share: float = 0.3
-    rows: int = 8192
+    pool: int = 20_000  # points of each shape
+    matched: int = 1000  # of them, which the guide has partners for
+    steps: int = 8  # of the midpoint rule between two keys, while it is learnt
+    guided: int = 256  # points with a partner, per end and step of the training
+    loose: int = 512  # others, likewise
+    regular: int = 1024  # places at which the regularity is evaluated, per step
+    around: float = 0.05  # how far these are from the paths
+    fades: float = 0.6  # share of the steps after which the guide is gone
+    far: float = 0.1  # residuals count linearly from here on, so that points without a partner do not dominate
+    data: float = 20.0  # weight of the ends
+    inside: float = 0.98  # radius that no path should leave
+    normals: float = 0.1  # cost of a pair with opposite normals, beside its squared distance
+    surroundings: float = 0.06  # cost of a pair with other surroundings
+    marked: float = 4.0  # weight of the squared differences of nearness to landmarks
+    depths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3)  # at which the surroundings are compared, inward and outward
+    blur: float = 0.1  # first blur of the optimal transport, squared length
+    least_blur: float = 0.003  # the last one
+    cooling: float = 0.93  # factor of the blur, per round
+    rounds: int = 100  # of Sinkhorn's iterations
+    left: float = 5.0  # cost of mass without a partner; above 2², or the rear of a shape that travelled stays behind
+    newton: int = 2  # steps to f = 0 of points that were carried
+    share: float = 0.3  # of a time budget, for learning the motion
+    rows: int = 8192  # points per call
 
 
 MOTION = MotionOptions()
@@ -144,15 +100,7 @@ def _surroundings(shape: StaticShape, seed: int) -> tuple[Tensor, Tensor, Tensor
 
 
 class MotionObjective(Objective):
-    """The loss of a velocity between key shapes, see the module.
-
-    Args:
-        velocity: trained.
-        shapes: in one frame.
-        keys: their times.
-        config: settings.
-        generator: CPU generator that draws the batches.
-    """
+    """The loss of a ``velocity`` between ``shapes`` in one frame, at the times ``keys``; see the module."""
 
     def __init__(
         self,

@@ -17,8 +17,6 @@ from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
 from .topology import surface_of, topology_of
 
-__all__ = ["TrackedMesh", "follow_mesh"]
-
 # So many cells on a side show how many pieces and holes a surface has; smaller ones than theirs do not count.
 TOPOLOGY_RESOLUTION = 64
 # A fixed step: near a change of topology adaptive ones would shrink to nothing before we can say when that was.
@@ -27,19 +25,12 @@ FOLLOW = Solver(method="rk4", step=0.02)
 
 @dataclass(frozen=True, eq=False)
 class TrackedMesh:
-    """A mesh, and where its vertices are at some times.
+    """A mesh, and where its vertices are at some times."""
 
-    Attributes:
-        faces: ``(F, 3)``, the same at all times.
-        times: ``(T,)``.
-        vertices: ``(T, V, 3)``.
-        normals: ``(T, V, 3)``, of unit length.
-    """
-
-    faces: NDArray[np.integer]
-    times: tuple[float, ...]
-    vertices: NDArray[np.float32]
-    normals: NDArray[np.float32]
+    faces: NDArray[np.integer]  # (F, 3), the same at all times
+    times: tuple[float, ...]  # (T,)
+    vertices: NDArray[np.float32]  # (T, V, 3)
+    normals: NDArray[np.float32]  # (T, V, 3), of unit length
 
 
 @torch.no_grad()
@@ -52,19 +43,11 @@ def follow_mesh(
     name: str = "the run",
     progress: Callable[[int, int], None] | None = None,
 ) -> TrackedMesh:
-    """Mesh a surface at the first time and follow its vertices (see `CarriedVelocity`) to the others.
+    """Mesh a surface at the first of ``times`` and follow its vertices (see `CarriedVelocity`) to the others.
 
     That is possible as long as the surface neither tears nor joins nor closes a hole, and every time is checked: the
     pieces and the Euler number of the slice are those of the start, the vertices have not lost the surface, and the
-    mesh has not folded over.
-
-    Args:
-        field: four-dimensional.
-        times: increasing.
-        resolution: of the mesh, in cells along the cube.
-        level: whose surface.
-        name: of the run, for messages.
-        progress: called with how many times are done, and of how many.
+    mesh has not folded over. ``resolution`` is in cells along the cube.
 
     Raises:
         InputError: there is no surface at the start, or it cannot be followed; says to which time.

@@ -10,13 +10,10 @@ from ...neural_fields.backend.devices import upload
 from ...neural_fields.fields.losses import eikonal_loss
 from ...neural_fields.spacetime.evolution import key_loss, law_loss
 from ...neural_fields.spacetime.field import spacetime_jet
-from ..training.focus import Focus
 from ..training.settings import EvolveConfig
-from ..training.trainer import Group, Objective, Report, Trainer, seeded, warm_cosine
+from ..training.trainer import Focus, Group, Objective, Report, Trainer, seeded, warm_cosine
 from .problem import Problem
 from .samples import Known, band_points, indices_in_band, uniform_spacetime
-
-__all__ = ["LONGEST_GRADIENT", "EvolveObjective", "learn_start"]
 
 # Norm of the gradient by the weights. Second derivatives have spikes, and a single one, at the peak of the learning
 # rate, would throw the field so far from any distance that it does not come back.
@@ -24,17 +21,10 @@ LONGEST_GRADIENT = 1.0
 
 
 class EvolveObjective(Objective):
-    """The terms of the finest level of a field.
+    """The terms of one level, the finest of a field; only parameters that require gradients are trained.
 
     A batch is half known samples, a sixteenth bounds (level 0 only), a sixteenth anywhere, which shall only obey the
     eikonal equation, and the rest near the surface, where the law holds.
-
-    Args:
-        field: on the device of the training. Only parameters that require gradients are trained.
-        problem: what it learns.
-        config: settings.
-        level: the level that is trained, the finest of ``field``.
-        generator: CPU generator that draws the batches.
 
     Raises:
         ValueError: a level above 0 has no known samples in its band.
@@ -140,10 +130,7 @@ class _StillObjective(Objective):
 def learn_start(
     known: Known, config: EvolveConfig, generator: torch.Generator, progress: Report, *, seconds: float | None = None
 ) -> SpaceTimeSDF:
-    """A field of one level that stands still: the shape at time 0, learnt in space alone and then lifted.
-
-    It takes ``start_steps``, but no longer than ``seconds``.
-    """
+    """A field of one level that stands still: the shape at time 0, learnt in space alone and then lifted."""
     with seeded(config.seed):
         siren = Siren(config.widths[0], config.depths[0], omega=config.omegas[0]).to(known.points)
     objective = _StillObjective(siren, known, config, generator)

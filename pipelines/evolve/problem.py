@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,14 +15,12 @@ from ...neural_fields.spacetime.evolution import Law, VectorField, mean_curvatur
 from ...neural_fields.spacetime.flow import IntegrationError, trajectories
 from ...neural_fields.spacetime.moving import Keyframes
 from ...neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
-from ..training.budget import BUDGET, Budget, affordable
-from ..training.report import Report
+from ..training.progress import Report
+from ..training.scaffold import BUDGET, Budget, affordable
 from ..training.settings import EvolveConfig
 from .deform import carried_samples, learn_motion, motion_figures
 from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform, values_at
 from .shapes import Placement, StaticShape, aligned, into_unit_sphere
-
-__all__ = ["End", "Problem", "between", "build_problem", "morph_law", "velocity_field"]
 
 END_POINTS = 50_000  # on a surface that shall be met
 REACH_POINTS = 2000
@@ -33,49 +30,29 @@ CAUTION = 0.8
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """A surface that shall be met.
+    """A surface that shall be met."""
 
-    Attributes:
-        name: of the shape.
-        time: when.
-        points: ``(N, 3)`` on it.
-        others: ``(N, 3)`` on it too, drawn independently.
-    """
-
-    name: str
+    name: str  # of the shape
     time: float
-    points: Tensor
-    others: Tensor
+    points: Tensor  # (N, 3) on it
+    others: Tensor  # (N, 3) on it too, drawn independently
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """An evolution to be learnt, in unit-sphere coordinates.
+    """An evolution to be learnt, in unit-sphere coordinates."""
 
-    Attributes:
-        similarity: from the first shape's input coordinates.
-        known: where the field is known; some of it at time 0.
-        bounds: where bounds are; may be empty.
-        law: what holds in between, or None where enough is known.
-        ends: the surfaces to be met.
-        placements: where each shape was put, from its own unit sphere.
-        motion: the velocity that carries the shapes, where one was learnt.
-        motion_figures: how well it does that, for each two shapes.
-        keys: moments between which the law moves a surface all the way from one shape to the next. The more of them,
-            the faster it moves: its error is taken per interval, not per unit of time, as what is known does not grow.
-        samples: known samples that were made, fewer than the settings' where a time budget left no time for all.
-    """
-
-    similarity: Similarity
-    known: Known
-    bounds: Bounds
-    law: Law | None
-    ends: tuple[End, ...]
-    placements: tuple[Placement, ...] = ()
-    motion: VelocitySiren | None = None
-    motion_figures: tuple[Mapping[str, float], ...] = ()
+    similarity: Similarity  # from the first shape's input coordinates
+    known: Known  # where the field is known; some of it at time 0
+    bounds: Bounds  # where bounds are; may be empty
+    law: Law | None  # what holds in between, or None where enough is known
+    ends: tuple[End, ...]  # the surfaces to be met
+    placements: tuple[Placement, ...] = ()  # where each shape was put, from its own unit sphere
+    motion: VelocitySiren | None = None  # the velocity that carries the shapes, where one was learnt
+    motion_figures: tuple[Mapping[str, float], ...] = ()  # how well it does that, for each two shapes
+    # moments between which the law moves one shape to the next; its error is taken per interval
     keys: tuple[float, ...] = (0.0, 1.0)
-    samples: int | None = None
+    samples: int | None = None  # known samples that were made; fewer than the settings' for want of time
 
 
 def build_problem(
@@ -86,14 +63,10 @@ def build_problem(
     progress: Report | None = None,
     budget: Budget | None = None,
 ) -> Problem:
-    """The problem that a configuration means.
+    """The problem that a configuration means, of shapes each in its own unit sphere.
 
-    Args:
-        shapes: each in its own unit sphere.
-        config: settings.
-        motion: of a deformation, if it is learnt already.
-        progress: of learning it.
-        budget: of time, of which the motion and the known samples get a share.
+    The ``motion`` of a deformation is learnt if it is not given. It and the known samples get a share of the
+    ``budget``.
 
     Raises:
         InputError: too few or too many shapes for this kind, or a motion that cannot be followed.
@@ -115,18 +88,11 @@ def build_problem(
 
 
 def between(times: Tensor, keys: Sequence[float], values: Tensor) -> tuple[Tensor, Tensor]:
-    """Bounds on a field whose surface stays between the shapes before and after it.
+    """Bounds ``(N,)``, below and above, on a field whose surface stays between two shapes; ±∞ for none.
 
-    What is outside both is at least as far from the surface as from the nearer of them, and inside both likewise:
-    ``f ≥ min(f_k, f_{k+1})`` where both are positive, ``f ≤ max(f_k, f_{k+1})`` where both are negative.
-
-    Args:
-        times: ``(N,)``.
-        keys: when each shape is reached, increasing.
-        values: ``(N, K)`` of the shapes' distances.
-
-    Returns:
-        Lower and upper bounds ``(N,)``, infinite where there are none.
+    What is outside both is at least as far from the surface as from the nearer of them, and inside both likewise: ``f ≥
+    min(f_k, f_{k+1})`` where both are positive, ``f ≤ max(f_k, f_{k+1})`` where both are negative. ``values`` ``(N,
+    K)`` are the shapes' distances, ``keys`` the increasing times of the shapes.
     """
     inner = torch.tensor(keys[1:-1], dtype=times.dtype, device=times.device)
     before = torch.bucketize(times, inner)[:, None]
@@ -164,12 +130,10 @@ def _deform(
     motion = motion or learn_motion(placed, keys, config, progress, budget=budget)
     frames = Keyframes(keys, [shape.field for shape in placed])
     carried = CarriedKeyframes(frames, motion)
-    made = _sampled(lambda count: carried_samples(carried, placed, count, config.seed), config, budget)
+    known, bounds, number = _sampled(lambda count: carried_samples(carried, placed, count, config.seed), config, budget)
     ends = tuple(_end(shape, time, config.seed) for shape, time in zip(placed, keys, strict=True))
     similarity, figures = _composed(shapes[0].similarity, region), tuple(motion_figures(motion, placed, keys))
-    return Problem(
-        similarity, made.known, made.bounds, None, ends, _placements(placed), motion, figures, samples=made.number
-    )
+    return Problem(similarity, known, bounds, None, ends, _placements(placed), motion, figures, samples=number)
 
 
 def _together(shapes: list[StaticShape], config: EvolveConfig) -> tuple[list[StaticShape], Similarity]:
@@ -192,20 +156,16 @@ def _morph(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | Non
         bounded = torch.isfinite(low) | torch.isfinite(high)
         return joined(known), Bounds(at_time(x, t)[bounded], CAUTION * low[bounded], CAUTION * high[bounded])
 
-    made = _sampled(samples, config, budget)
+    known, bounds, number = _sampled(samples, config, budget)
     guide = Keyframes(keys, [shape.field for shape in placed]).requires_grad_(False)
     ends = tuple(_end(shape, time, config.seed) for shape, time in pairs)
     similarity = _composed(shapes[0].similarity, region)
     law, places = morph_law(guide), _placements(placed)
-    return Problem(similarity, made.known, made.bounds, law, ends, places, keys=keys, samples=made.number)
+    return Problem(similarity, known, bounds, law, ends, places, keys=keys, samples=number)
 
 
 def morph_law(guide: Field) -> Law:
-    """Level-set morphing that keeps distances: `morph` with the speed of the surface point below.
-
-    Args:
-        guide: g, four-dimensional; the surface moves outward with −∂g/∂t.
-    """
+    """Level-set morphing that keeps distances: normal speed −∂g/∂t of the ``guide`` g, at the surface point below."""
 
     @torch.no_grad()
     def speed(x: Tensor, t: Tensor) -> Tensor:
@@ -229,17 +189,17 @@ def _smooth(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | No
         low = CAUTION * beyond[outside]
         return known, Bounds(at_time(x, t)[outside], low, torch.full_like(low, math.inf))
 
-    made = _sampled(samples, config, budget)
+    known, bounds, number = _sampled(samples, config, budget)
     end = _end(shape, 0.0, config.seed)
     law = mean_curvature(alpha, extend=True)
     similarity, places = _composed(shape.similarity, region), _placements(placed)
-    return Problem(similarity, made.known, made.bounds, law, (end,), places, samples=made.number)
+    return Problem(similarity, known, bounds, law, (end,), places, samples=number)
 
 
 def _transport(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | None) -> Problem:
-    shapes = aligned(shapes, "none")
+    shapes, times = aligned(shapes, "none"), [index / 8 for index in range(9)]
     reach = [
-        trajectories(_velocity(config, index, Similarity.identity()), shape.points(REACH_POINTS, 0), _reach_times())
+        trajectories(_velocity(config, index, Similarity.identity()), shape.points(REACH_POINTS, 0), times)
         for index, shape in enumerate(shapes)
     ]
     placed, region = into_unit_sphere(shapes, torch.cat(reach).reshape(-1, 3).double().numpy())
@@ -258,32 +218,26 @@ def _transport(shapes: list[StaticShape], config: EvolveConfig, budget: Budget |
         known = carried.samples(torch.cat(points))
         return (known, no_bounds()) if rigid else signs(known)
 
-    made = _sampled(samples, config, budget)
+    known, bounds, number = _sampled(samples, config, budget)
     law = transport(velocities[0], extend=not rigid) if len(placed) == 1 else None
     name = " + ".join(shape.name for shape in shapes)
     ends = tuple(
         End(name, time, *(carried.surface(placed, time, END_POINTS, seed) for seed in (0, 1))) for time in (0.0, 1.0)
     )
     similarity, places = _composed(shapes[0].similarity, region), _placements(placed)
-    return Problem(similarity, made.known, made.bounds, law, ends, places, samples=made.number)
+    return Problem(similarity, known, bounds, law, ends, places, samples=number)
 
 
-class _Sampled(NamedTuple):
-    """Known samples and bounds, and how many samples were asked for."""
-
-    known: Known
-    bounds: Bounds
-    number: int
-
-
-def _sampled(samples: Callable[[int], tuple[Known, Bounds]], config: EvolveConfig, budget: Budget | None) -> _Sampled:
-    """As many samples as the settings want, or as a time budget leaves time for."""
+def _sampled(
+    samples: Callable[[int], tuple[Known, Bounds]], config: EvolveConfig, budget: Budget | None
+) -> tuple[Known, Bounds, int]:
+    """Known samples and bounds, and their number: the settings', or what a time budget leaves time for."""
     count, left = config.samples, None if budget is None else budget.left()
     if budget is not None and left is not None:
         count = affordable(samples, config.samples, BUDGET.sampling_share * left)
         if count < config.samples:
             budget.notes.append(f"{count:,} known samples instead of {config.samples:,}")
-    return _Sampled(*samples(count), count)
+    return *samples(count), count
 
 
 def _velocity(config: EvolveConfig, index: int, region: Similarity) -> VectorField:
@@ -301,10 +255,6 @@ def _velocity(config: EvolveConfig, index: int, region: Similarity) -> VectorFie
 
 def _end(shape: StaticShape, time: float, seed: int) -> End:
     return End(shape.name, time, *(shape.points(END_POINTS, seed + 101 + index) for index in range(2)))
-
-
-def _reach_times() -> list[float]:
-    return [index / 8 for index in range(9)]
 
 
 def _placements(shapes: Sequence[StaticShape]) -> tuple[Placement, ...]:

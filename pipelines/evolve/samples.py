@@ -14,51 +14,23 @@ from ...neural_fields.spacetime.evolution import VectorField
 from ..fit.samples import DOMAIN, Rows
 from .shapes import StaticShape
 
-__all__ = [
-    "Bounds",
-    "Carried",
-    "Known",
-    "around",
-    "band_points",
-    "indices_in_band",
-    "joined",
-    "known_at",
-    "no_bounds",
-    "signs",
-    "uniform",
-    "uniform_spacetime",
-    "values_at",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Known(Rows):
-    """Samples of space-time where the field is known.
+    """Samples of space-time where the field is known."""
 
-    Attributes:
-        points: ``(N, 4)``.
-        value: ``(N,)``.
-        gradient: ``(N, 3)``, by space.
-    """
-
-    points: Tensor
-    value: Tensor
-    gradient: Tensor
+    points: Tensor  # (N, 4)
+    value: Tensor  # (N,)
+    gradient: Tensor  # (N, 3), by space
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds(Rows):
-    """Samples of space-time where the field is only known to lie between two numbers.
+    """Samples of space-time where the field is only known to lie between two numbers."""
 
-    Attributes:
-        points: ``(N, 4)``.
-        low: ``(N,)``; −∞ where nothing is known.
-        high: ``(N,)``; ∞ likewise.
-    """
-
-    points: Tensor
-    low: Tensor
-    high: Tensor
+    points: Tensor  # (N, 4)
+    low: Tensor  # (N,); −∞ where nothing is known
+    high: Tensor  # (N,); ∞ likewise
 
 
 class Carried:
@@ -172,18 +144,10 @@ def _first_near(field: Field, points: Tensor, count: int, width: float) -> Tenso
 def band_points(
     field: Field, count: int, width: float, generator: torch.Generator, *, level: int = -1, reach: float = 0.1
 ) -> Tensor:
-    """Points ``(n, 4)``, about ``count`` of them, spread evenly over ``|f| < width``.
+    """Points ``(n, 4)``, about ``count`` of them, spread evenly over |f| < ``width`` of a four-dimensional field.
 
-    Points anywhere, of which those near the surface are moved along ∇f to a value of their own; of a residual
-    level only those in its band are kept.
-
-    Args:
-        field: four-dimensional.
-        count: about how many.
-        width: half-width of the band.
-        generator: CPU generator.
-        level: whose surface.
-        reach: how near, |f| of the coarsest level, a point must be to be moved.
+    Points anywhere, of which those with |f| < ``reach`` at the coarsest level are moved along ∇f to a value of their
+    own; of a residual level only those in its band are kept.
     """
     level, device = field.resolve_level(level), field.deltas.device
     points = uniform_spacetime(6 * count, generator).to(device)  # tried: few are near the surface

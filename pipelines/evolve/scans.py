@@ -1,8 +1,4 @@
-"""Scans and meshes as shapes of an evolution: each file is fitted once, beside the run, and the fits are evolved.
-
-Meshes with the same faces are one mesh in several poses: their vertices are known to be the same, and some of them
-become the landmarks of a deformation.
-"""
+"""Scans and meshes as shapes of an evolution: each is fitted once, beside the run; poses of one mesh give landmarks."""
 
 from __future__ import annotations
 
@@ -19,21 +15,14 @@ from ...neural_fields import Mesh, load_field
 from ...neural_fields.backend.files import write_whole
 from ..fit.train import fit
 from ..surface.surface import read_surface
-from ..training.config import load_config
 from ..training.folder import FIELD_FILE, STATE_FILE, find_field, is_fitted, read_record
-from ..training.report import Report
-from ..training.settings import EvolveConfig, FitConfig
-from .landmarks import FAR_OUT
-
-__all__ = ["fits_beside", "fitted_scans", "scans_among"]
+from ..training.progress import Report
+from ..training.settings import EvolveConfig, FitConfig, load_config
+from .shapes import FAR_OUT
 
 
 def scans_among(shapes: Sequence[str]) -> dict[str, Mesh]:
-    """Those of the shapes that are files of points or triangles, read.
-
-    Raises:
-        InputError: one of them cannot be read.
-    """
+    """Those of the shapes that are files of points or triangles, read; InputError if one cannot be."""
     files = [text for text in dict.fromkeys(shapes) if Path(text).is_file() and Path(text).suffix != ".safetensors"]
     return {text: read_surface(text) for text in files}
 
@@ -44,24 +33,12 @@ def fits_beside(run: Path) -> Path:
 
 
 def fitted_scans(
-    config: EvolveConfig,
-    scans: Mapping[str, Mesh],
-    folder: Path,
-    fits: FitConfig,
-    *,
-    progress: Report | None = None,
+    config: EvolveConfig, scans: Mapping[str, Mesh], folder: Path, fits: FitConfig, *, progress: Report | None = None
 ) -> EvolveConfig:
-    """The same evolution of fits: what is in the folder already is taken, or goes on.
+    """The same evolution with fits in place of ``scans``: what is in the ``folder`` already is taken, or goes on.
 
     Where all shapes of a deformation are meshes with the same faces, and no landmarks were given, up to 400 vertices
     become landmarks, files of which are written beside the fits.
-
-    Args:
-        config: whose shapes are files, among others.
-        scans: what `scans_among` has read.
-        folder: see `fits_beside`.
-        fits: settings of the fits.
-        progress: called now and then with how far a fit is.
 
     Raises:
         InputError: a cloud cannot be used.

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...datasets.landmarks import read_landmarks
 from ...neural_fields import (
     Box,
     Capsule,
@@ -33,8 +34,6 @@ from ...neural_fields import (
 from ...neural_fields.fields.csg import Bounded
 from ..surface.surface import sample_points
 from ..training.folder import find_field
-
-__all__ = ["Placed", "Placement", "StaticShape", "aligned", "into_unit_sphere", "read_shape"]
 
 Float64 = NDArray[np.float64]
 
@@ -125,20 +124,13 @@ class Placed(Field):
 
 @dataclass(frozen=True, eq=False)
 class StaticShape:
-    """A static shape.
+    """A static shape."""
 
-    Attributes:
-        name: what the user called it.
-        field: three-dimensional, on the CPU.
-        similarity: from input coordinates to the shape's own unit sphere.
-        surface: its surface, in the coordinates of ``field``.
-        placement: from its own unit sphere to the coordinates of ``field``.
-    """
-
-    name: str
-    field: Field
-    similarity: Similarity
-    surface: Mesh
+    name: str  # what the user called it
+    field: Field  # three-dimensional, on the CPU
+    similarity: Similarity  # from input coordinates to the shape's own unit sphere
+    surface: Mesh  # in the coordinates of ``field``
+    # from its own unit sphere to the coordinates of ``field``
     placement: Placement = dataclasses.field(default_factory=Placement)
 
     def points(self, count: int, seed: int) -> Tensor:
@@ -184,13 +176,11 @@ def read_shape(text: str) -> StaticShape:
 
 
 def aligned(shapes: list[StaticShape], how: Literal["none", "center", "pca"]) -> list[StaticShape]:
-    """All shapes in the frame of the first: its unit sphere.
+    """All shapes, each in its own unit sphere, in that of the first.
 
-    Args:
-        shapes: each in its own unit sphere.
-        how: "none" keeps the places and sizes that the shapes have in their input coordinates; "center" lays the
-            unit spheres on each other; "pca" turns each shape as well, so that its principal axes are those of the
-            first, the way round in which both have most volume in common.
+    "none" keeps the places and sizes of their input coordinates; "center" lays the unit spheres on each other; "pca"
+    turns each shape as well, to the principal axes of the first, the way round in which both have most volume in
+    common.
     """
     first = shapes[0]
     placed = [first]
@@ -208,12 +198,7 @@ def aligned(shapes: list[StaticShape], how: Literal["none", "center", "pca"]) ->
 
 
 def into_unit_sphere(shapes: list[StaticShape], reach: Float64) -> tuple[list[StaticShape], Similarity]:
-    """The shapes shrunk until all that they will ever reach lies in the unit sphere, and the similarity that did it.
-
-    Args:
-        shapes: in one frame.
-        reach: points ``(N, 3)`` of the surfaces at all times.
-    """
+    """The shapes shrunk until all points ``(N, 3)`` that they reach lie in the unit sphere, and the similarity."""
     # A mesh leaves its unit sphere by less than a thousandth.
     if np.linalg.norm(reach, axis=1).max() <= 1.001:
         return shapes, Similarity.identity()
@@ -267,3 +252,47 @@ def _axes(surface: Mesh) -> Float64:
     _, axes = np.linalg.eigh(np.cov(points.T))
     axes[:, 0] *= np.sign(np.linalg.det(axes))
     return axes
+
+
+Float64 = NDArray[np.float64]
+FAR_OUT = 0.1  # how far from its surface a landmark may lie, in units of the field: fits and picks are not exact
+
+
+class Landmarks(NamedTuple):
+    """Pairs of points: ``(P, 3)`` of a shape, and the same points of the next shape."""
+
+    before: Tensor
+    after: Tensor
+
+
+def placed_landmarks(paths: Sequence[str], shapes: Sequence[StaticShape]) -> list[Landmarks]:
+    """The landmarks of each two shapes, in the frame that the shapes were put in; none where there are no files.
+
+    Raises:
+        InputError: a file cannot be read, or a landmark is not on its shape.
+    """
+    if not paths:
+        none = torch.empty(0, 3)
+        return [Landmarks(none, none)] * (len(shapes) - 1)
+    found = []
+    for index, path in enumerate(paths):
+        both = zip(read_landmarks(path), shapes[index : index + 2], strict=True)
+        found.append(Landmarks(*(_placed(path, points, shape) for points, shape in both)))
+    return found
+
+
+def nearness(points: Tensor, landmarks: Tensor) -> Tensor:
+    """exp(−|x − a|² / 2σ²) of points ``(N, 3)`` and landmarks ``(P, 3)``, ``(N, P)``: alike for points that match."""
+    # 0.3: the distance within which a landmark says something about its neighbours.
+    return torch.exp(-torch.cdist(points, landmarks).square() / (2 * 0.3**2))
+
+
+@torch.no_grad()
+def _placed(path: str, points: Float64, shape: StaticShape) -> Tensor:
+    placed = torch.from_numpy(shape.placement.apply(shape.similarity.to_unit(points))).float()
+    value = shape.field.value(placed).abs()
+    worst = int(value.argmax())
+    if not float(value[worst]) <= FAR_OUT:
+        where = " ".join(f"{number:g}" for number in points[worst])
+        raise InputError(f"{path}: landmark {where} is not on {shape.name}; give coordinates of that shape's own input")
+    return placed

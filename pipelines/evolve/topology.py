@@ -1,8 +1,7 @@
-"""Where and when a surface that moves changes its topology: pieces and holes, and the moments at which they change.
+"""Changes of topology of a surface that moves. Of c pieces with h holes the Euler number is χ = V − E + F = 2 (c − h).
 
-A closed surface of c pieces with h holes through them (the sum of their genera) has the Euler number
-χ = V − E + F = 2 (c − h). A smooth f(x, t) changes neither but where ∇f = 0 on the surface, at single points of
-space-time, so that two moments before and after a change differ near one place and nowhere else.
+f(x, t) changes it only where ∇f = 0 on the surface, at single points of space-time, so that two moments before and
+after a change differ near one place and nowhere else.
 """
 
 from __future__ import annotations
@@ -21,41 +20,26 @@ from ...neural_fields import Field, Mesh, NoSurfaceError, TimeSlice, at_time, ex
 from ...neural_fields.fields.function import FieldLike
 from ..surface.surface import components
 
-__all__ = ["CHANGES", "Change", "ChangeOptions", "Topology", "find_changes", "surface_of", "topology_of"]
-
 
 @dataclass(frozen=True)
 class ChangeOptions:
-    """How changes of topology are searched for.
+    """How changes of topology are searched for."""
 
-    Attributes:
-        narrow: a change is searched for until it lies between two moments that are no further apart.
-        one: changes that follow each other so soon are one: on a lattice a neck closes in several places.
-        most: moments that are meshed on the way, of all changes together.
-        placed: changes whose place is searched for, of the first ones; a field of more was not trained long enough.
-        cells: a place is searched for until it lies in a box of so many cells.
-    """
-
-    narrow: float = 2e-3
-    one: float = 1e-2
-    most: int = 60
-    placed: int = 6
-    cells: int = 2
+    narrow: float = 2e-3  # a change is searched for until it lies between two moments that are no further apart
+    one: float = 1e-2  # changes that follow each other so soon are one: on a lattice a neck closes in several places
+    most: int = 60  # moments that are meshed on the way, of all changes together
+    placed: int = 6  # changes whose place is searched for, of the first ones
+    cells: int = 2  # a place is searched for until it lies in a box of so many cells
 
 
 CHANGES = ChangeOptions()
 
 
 class Topology(NamedTuple):
-    """What a surface is like as a whole.
+    """What a surface is like as a whole."""
 
-    Attributes:
-        components: pieces.
-        holes: through them, the sum of their genera.
-    """
-
-    components: int
-    holes: int
+    components: int  # pieces
+    holes: int  # through them, the sum of their genera
 
     def __str__(self) -> str:
         """As in "1 piece with 0 holes"."""
@@ -65,21 +49,13 @@ class Topology(NamedTuple):
 
 @dataclass(frozen=True)
 class Change:
-    """One change of topology.
+    """One change of topology."""
 
-    Attributes:
-        time: the middle of the moments that it lies between.
-        within: how far they are from it.
-        before: the surface at the first of them.
-        after: at the second.
-        place: where, to two cells of the mesh; None of all but the first ones.
-    """
-
-    time: float
-    within: float
-    before: Topology
-    after: Topology
-    place: tuple[float, float, float] | None
+    time: float  # the middle of the moments that it lies between
+    within: float  # how far they are from it
+    before: Topology  # the surface at the first of them
+    after: Topology  # at the second
+    place: tuple[float, float, float] | None  # where, to two cells of the mesh; None of all but the first ones
 
 
 def topology_of(surface: Mesh | None) -> Topology:
@@ -101,23 +77,12 @@ def surface_of(field: FieldLike, *, resolution: int, level: int = -1) -> Mesh | 
 
 
 def find_changes(
-    field: Field,
-    times: Sequence[float],
-    found: Sequence[Topology],
-    *,
-    resolution: int = 96,
-    until: float = math.inf,
+    field: Field, times: Sequence[float], found: Sequence[Topology], *, resolution: int = 96, until: float = math.inf
 ) -> list[Change]:
-    """The changes between moments whose topology is known, each by halving the interval that it lies in.
+    """The changes between growing ``times`` whose topology is ``found``, each by halving the interval that it lies in.
 
-    What happens and is undone between two of the given moments, or within 0.01, is not seen.
-
-    Args:
-        field: four-dimensional.
-        times: ``(T,)``, growing.
-        found: the topology at each, of meshes of the same ``resolution``.
-        resolution: cells along each side of the meshes.
-        until: moment, by `time.monotonic`, from which intervals stay as wide as they are and places unknown.
+    What happens and is undone between two of the given moments, or within 0.01, is not seen. From the moment ``until``,
+    by `time.monotonic`, intervals stay as wide as they are and places unknown.
     """
     pending = [
         _Bracket(times[index - 1], times[index], found[index - 1], found[index])

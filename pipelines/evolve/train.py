@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,31 +18,24 @@ from torch import Tensor
 from ...neural_fields import InputError, MultiscaleSDF, SpaceTimeSDF
 from ..fit.band import delta_of
 from ..fit.level import new_level
-from ..training.budget import BUDGET, Budget, step_seconds
-from ..training.folder import RunFolder, digest_of
-from ..training.machine import choose_device, environment
-from ..training.motion import VELOCITY_FILE, load_motion
-from ..training.report import Progress, Report, reported, silent
+from ..training.folder import VELOCITY_FILE, RunFolder, digest_of, load_motion
+from ..training.progress import Progress, Report, reported, silent
 from ..training.result import Run
+from ..training.scaffold import BUDGET, Budget, Training
 from ..training.settings import EvolveConfig
 from ..training.trainer import (
     Interrupted,
     StopFlag,
     Trainer,
-    checkpoint_of,
     load_compiler,
     parameter_count,
     restore_frozen,
     stop_on_signals,
-    without_prefix,
 )
 from .checks import check_evolution, frame_figures
-from .landmarks import read_landmarks
 from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
 from .problem import Problem, build_problem
-from .shapes import StaticShape, read_shape
-
-__all__ = ["Evolution", "evolve", "train_evolution"]
+from .shapes import StaticShape, read_landmarks, read_shape
 
 # Of a time budget, what the start and the checks may take.
 STARTING_SHARE, CHECKING_SHARE = 0.2, 0.25
@@ -55,11 +49,7 @@ class Evolution(Run[SpaceTimeSDF]):
 
 
 def evolve(
-    config: EvolveConfig,
-    *,
-    out: str | Path | None = None,
-    resume: bool = False,
-    progress: Report | None = None,
+    config: EvolveConfig, *, out: str | Path | None = None, resume: bool = False, progress: Report | None = None
 ) -> Evolution:
     """Train a field of space-time.
 
@@ -113,9 +103,8 @@ def train_evolution(
     The ``budget`` is that of the settings where it began earlier; by default it begins now.
     """
     names, folder = [shape.name for shape in shapes or []], RunFolder(out, resume=resume)
-    device = choose_device(config.device)
     budget = budget or Budget(config.time_budget)
-    training = _Evolving(problem, names, config, device, folder, progress or silent, budget)
+    training = _Evolving(problem, names, config, folder, progress or silent, budget)
     with folder.writing(VELOCITY_FILE), stop_on_signals() as flag:
         if resume:
             training.restore()
@@ -124,31 +113,26 @@ def train_evolution(
         return training.run(flag)
 
 
-class _Evolving:
-    """One evolution under way: the frozen levels, and the records of their stages."""
+class _Evolving(Training[EvolveConfig, SpaceTimeSDF]):
+    """One evolution under way."""
 
     def __init__(
         self,
         problem: Problem,
         names: list[str],
         config: EvolveConfig,
-        device: torch.device,
         folder: RunFolder,
         report: Report,
         budget: Budget,
     ) -> None:
-        self.problem, self.names, self.config, self.device = problem, names, config, device
-        self.folder, self.report, self.budget = folder, report, budget
-        self.costs: dict[int, float] = {}  # measured seconds of a step, by level
+        super().__init__(config, folder, budget, report)
+        self.problem, self.names, self.similarity = problem, names, problem.similarity
         self.frame_seconds = 0.0  # to check a frame
         self.fingerprint = digest_of(part.numpy() for part in vars(problem.known).values())
-        self.frozen: SpaceTimeSDF | None = None
-        self.stages: list[dict[str, Any]] = []
-        self.trainer_state: dict[str, Tensor] = {}
 
     def run(self, flag: StopFlag) -> Evolution:
         for level in range(len(self.stages), self.config.num_levels):
-            if level and self.share(level) is None:
+            if level and self.level_share(level) is None:
                 self.budget.leave_out(level, self.config.num_levels)
                 break
             self.train_level(level, flag)
@@ -161,19 +145,18 @@ class _Evolving:
             self.report(Progress("checks", done, total, done / total, {}))
 
         count(0, 1)
-        resolution, left = self.config.resolution, self.budget.left()
-        until = math.inf if left is None else time.monotonic() + left
+        left = self.budget.left()
         record["checks"] = check_evolution(
             field,
             self.problem.ends,
-            self.problem.similarity,
+            self.similarity,
             frames=frames,
-            resolution=resolution,
+            resolution=self.config.resolution,
             count=count,
-            until=until,
+            until=math.inf if left is None else time.monotonic() + left,
         )
-        record = self.folder.finish(field, self.problem.similarity, record)
-        return Evolution(field, self.problem.similarity, self.folder.out, record)
+        record = self.folder.finish(field, self.similarity, record)
+        return Evolution(field, self.similarity, self.folder.out, record)
 
     def train_level(self, level: int, flag: StopFlag) -> None:
         """Begin one level, train it, freeze it."""
@@ -190,10 +173,7 @@ class _Evolving:
             ) from error
         seconds, steps = self.seconds_for(level, field), config.steps[level]
         trainer = Trainer(objective, stage=f"level {level}", steps=steps, seconds=seconds, clip=LONGEST_GRADIENT)
-        if self.trainer_state:
-            trainer.restore(self.trainer_state)
-            self.trainer_state = {}
-        if not trainer.run(flag, report=self.report, save=lambda: self.save(field, trainer)):
+        if not self.take_steps(trainer, flag, lambda: field):
             raise Interrupted(self.folder.out)
         self.frozen = field.requires_grad_(False)
         errors = self.errors_at_ends()
@@ -248,25 +228,21 @@ class _Evolving:
         rows = [torch.nn.functional.pad(end.points, (0, 1), value=end.time) for end in self.problem.ends]
         return torch.cat([self.frozen.value(part.to(self.device)).cpu() for part in torch.cat(rows).split(1 << 16)])
 
-    def share(self, level: int) -> float | None:
-        """Seconds for the training of a level; None if it is not worth beginning, infinite without a budget."""
+    def level_share(self, level: int) -> float | None:
+        """Seconds for the training of a level, see `Training.share`."""
         left = self.budget.left()
-        if left is None:
-            return math.inf
-        left = max(left - min(self.checking_seconds(), CHECKING_SHARE * left), BUDGET.least_seconds)
-        steps, begun = self.config.steps[: self.config.num_levels], bool(self.trainer_state)
-        return self.budget.share(left, level, steps, self.cost, begun=begun)
+        if left is not None:
+            left = max(left - min(self.checking_seconds(), CHECKING_SHARE * left), BUDGET.least_seconds)
+        return self.share(level, self.config.steps[: self.config.num_levels], left)
 
-    def cost(self, level: int) -> float:
-        """Measured seconds of a training step of a level, on networks that are not trained."""
-        if level not in self.costs:
-            field = self.empty(level + 1).to(self.device).requires_grad_(False)
-            field.sdf.levels[level].requires_grad_(True)
-            generator = torch.Generator().manual_seed(0)
-            objective = EvolveObjective(field, self.problem, self.config, level=level, generator=generator)
-            steps, left = itertools.count(), self.budget.left() or 0.0
-            self.costs[level] = step_seconds(lambda: objective.losses(next(steps), 0.0)[1], left)
-        return self.costs[level]
+    def timed_step(self, level: int) -> Callable[[], Tensor]:
+        """See `Training.timed_step`."""
+        field = self.empty(level + 1).to(self.device).requires_grad_(False)
+        field.sdf.levels[level].requires_grad_(True)
+        generator = torch.Generator().manual_seed(0)
+        objective = EvolveObjective(field, self.problem, self.config, level=level, generator=generator)
+        steps = itertools.count()
+        return lambda: objective.losses(next(steps), 0.0)[1]
 
     def seconds_for(self, level: int, field: SpaceTimeSDF) -> float | None:
         """How long a level may train that begins as ``field``; None without a budget."""
@@ -275,8 +251,7 @@ class _Evolving:
         begun, shown = time.monotonic(), copy.deepcopy(field).cpu()
         frame_figures(shown, 0.0, self.config.resolution)
         self.frame_seconds = time.monotonic() - begun
-        took = float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0
-        return max(self.share(level) or 0.0, BUDGET.least_seconds) + took
+        return max(self.level_share(level) or 0.0, BUDGET.least_seconds) + self.elapsed
 
     def checking_seconds(self) -> float:
         """Seconds for all checks at the end, at what a frame took when the last level began."""
@@ -293,41 +268,23 @@ class _Evolving:
             self.budget.notes.append(f"{count} frames are checked instead of {frames}")
         return count
 
-    def save(self, field: SpaceTimeSDF, trainer: Trainer[EvolveObjective] | None) -> None:
-        """Write a usable field and all that `restore` needs."""
-        tensors = checkpoint_of(self.frozen, trainer)
-        progress = {"fingerprint": self.fingerprint, "stages": self.stages, "notes": self.budget.notes}
-        self.folder.save(field, self.problem.similarity, self.record(finished=False), tensors, progress)
-
     def restore(self) -> None:
-        """Take up an interrupted run; see `RunFolder.restore`."""
+        """Take up an interrupted run."""
         names = ", ".join(self.names)
-        mismatch = f"{names}: not the shapes that {self.folder.path} was trained on; bring those back"
-        tensors, progress = self.folder.restore(self.fingerprint, mismatch)
-        self.stages, self.budget.notes = progress["stages"], progress.get("notes", [])
+        tensors, _ = self.restored(f"{names}: not the shapes that {self.folder.path} was trained on; bring those back")
         if self.stages:
             self.frozen = restore_frozen(self.empty(len(self.stages)).to(self.device), tensors)
-        self.trainer_state = without_prefix("trainer.", tensors)
-        took = sum(stage["beginning_seconds"] + stage["training_seconds"] for stage in self.stages)
-        self.budget.before = took + (float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0)
 
     def record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
-        seconds = sum(stage["beginning_seconds"] + stage["training_seconds"] for stage in self.stages)
+        motion = self.problem.motion_figures if self.problem.motion is not None else None
         return {
-            "finished": finished,
             "kind": self.config.kind,
             "shapes": self.names,
             "align": self.config.align,
             "placements": [placement.as_dict() for placement in self.problem.placements],
             "ends": [{"name": end.name, "time": end.time} for end in self.problem.ends],
-            **({"motion": list(map(dict, self.problem.motion_figures))} if self.problem.motion is not None else {}),
-            "similarity": dataclasses.asdict(self.problem.similarity),
-            "config": dataclasses.asdict(self.config),
-            "stages": self.stages,
-            "parameters": sum(stage["parameters"] for stage in self.stages),
-            "deltas": [stage["delta"] for stage in self.stages if stage["delta"] is not None],
-            "training_seconds": round(seconds, 3),
-            **self.budget.record(),
-            "environment": environment(self.device),
+            **({} if motion is None else {"motion": list(map(dict, motion))}),
+            **self.common_record(finished=finished),
+            **self.stages_record(),
         }

@@ -21,11 +21,11 @@ from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.large import Merging
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
 from ..surface.surface import thinned
-from ..training.budget import BUDGET, Budget, affordable, least_share, step_seconds
 from ..training.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
 from ..training.machine import choose_device, environment, peak_memory
-from ..training.report import reported, silent
+from ..training.progress import reported, silent
 from ..training.result import Run
+from ..training.scaffold import BUDGET, Budget, affordable, least_share, step_seconds
 from ..training.settings import FitConfig
 from ..training.trainer import (
     Interrupted,

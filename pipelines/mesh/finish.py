@@ -13,10 +13,9 @@ from ...datasets import read_cloud
 from ...neural_fields import InputError, Similarity
 from ...neural_fields.meshing.extract import Mesh
 from ..fit.depth import DepthInput, trim_suggestion
-from ..texture.samples import has_colors
-from ..texture.train import FittedTexture, texture_run
+from ..texture.train import FittedTexture, has_colors, texture_run
 from ..training.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file
-from ..training.report import Progress, reported
+from ..training.progress import Progress, reported
 from ..training.settings import TextureConfig
 from .extract import MeshOptions, mesh_run
 from .files import check_mesh_path

@@ -19,7 +19,7 @@ from ...neural_fields.meshing.mesh import check_mesh_path
 from ..mesh.bake import check_texture_size, textured_mesh
 from ..mesh.extract import normals_near
 from ..mesh.files import check_textured_path
-from ..reconstruct.data.visibility import seen_points
+from ..reconstruct.views import seen_points
 from ..surface.surface import Support, seen_part
 
 __all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "part_seen"]

@@ -19,8 +19,6 @@ from nerfstudio.plugins.types import MethodSpecification  # pyright: ignore[repo
 from .model import RATES, MultiscaleFactoModelConfig, MultiscaleModelConfig
 from .schedule import STEPS, WarmCosineConfig
 
-__all__ = ["mplicits", "mplicits_facto"]
-
 
 def _trainer(name: str, model: Any, groups: dict[str, float]) -> Any:
     """A training with one optimiser for each group of parameters, by its rate."""

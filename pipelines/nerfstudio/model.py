@@ -27,16 +27,6 @@ from ...neural_fields.networks.hash_encoding import HashEncoding, tables_apart
 from ..training.settings import ReconstructConfig
 from .schedule import WarmCosine
 
-__all__ = [
-    "RATES",
-    "MultiscaleFactoModel",
-    "MultiscaleFactoModelConfig",
-    "MultiscaleFieldConfig",
-    "MultiscaleModel",
-    "MultiscaleModelConfig",
-    "build_field",
-]
-
 OURS = ReconstructConfig()  # colours are those of `mplicits reconstruct`
 COLOR_RATE = OURS.color_rate * OURS.learning_rate
 # Peak rates of Adam for the groups of parameters; the geometry is made to suit its own (`rescale_parameters`).
@@ -87,14 +77,9 @@ class MultiscaleFieldConfig(InstantiateConfig):
 
 
 def build_field(config: MultiscaleFieldConfig, *, aabb: Tensor, **_: object) -> NerfstudioField:
-    """The untrained field of a scene, a sphere of unknown colour.
+    """The untrained field of a scene, a sphere of unknown colour, in the scene box ``aabb`` ``(2, 3)``.
 
-    The hash encoding of its colours covers the cube around the scene box.
-
-    Args:
-        config: settings.
-        aabb: the scene box ``(2, 3)``, whose corners the field's unit sphere takes in.
-        _: what else nerfstudio hands to its own field: contraction, number of images, appearance.
+    The hash encoding of its colours covers the cube around the box. What else nerfstudio hands to its field is ignored.
     """
     sdf = MultiscaleSDF.from_widths(
         list(zip(config.widths, config.depths, strict=True)),
@@ -113,12 +98,7 @@ def build_field(config: MultiscaleFieldConfig, *, aabb: Tensor, **_: object) -> 
         grid=HashEncoding.up_to(finest, extent=extent) if finest else None,
     )
     shell = NerfstudioField(
-        sdf,
-        color,
-        heads=FieldHeadNames,
-        bounds=aabb,
-        deviation=config.deviation,
-        learning_rate=config.learning_rate,
+        sdf, color, heads=FieldHeadNames, bounds=aabb, deviation=config.deviation, learning_rate=config.learning_rate
     )
     assert isinstance(sdf.base, Siren)
     with torch.enable_grad():
@@ -201,11 +181,7 @@ class MultiscaleFactoModel(_Multiscale, NeuSFactoModel):
 
 
 class LaterMetric(nn.Module):
-    """A metric that is built when it is first asked for, and says NaN where its weights cannot be downloaded.
-
-    Args:
-        build: makes the metric.
-    """
+    """A metric that ``build`` makes when it is first asked for; NaN where its weights cannot be downloaded."""
 
     def __init__(self, build: Any) -> None:
         super().__init__()

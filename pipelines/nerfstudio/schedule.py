@@ -10,8 +10,6 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig  # pyright: 
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-__all__ = ["STEPS", "WarmCosine", "WarmCosineConfig"]
-
 STEPS = 20_000
 
 

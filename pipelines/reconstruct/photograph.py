@@ -20,26 +20,17 @@ from ..render.draw import RenderOptions, render_run
 from ..render.picture import Image
 from ..training.folder import RADIANCE_FILE, find_field, load_still
 from ..training.machine import choose_device
-from .model.model import SceneModel
+from .model import SceneModel
 from .views import render_camera
-
-__all__ = ["TrainedScene", "open_scene", "photograph"]
 
 
 class TrainedScene(NamedTuple):
-    """What a reconstruction has left to be rendered.
-
-    Attributes:
-        model: geometry, colours and what is behind, in unit-sphere coordinates.
-        similarity: the way back to world coordinates.
-        sampling: where its rays are sampled.
-        guide: values of the coarsest level by which they are, or None.
-    """
+    """What a reconstruction has left to be rendered, in unit-sphere coordinates."""
 
     model: SceneModel
-    similarity: Similarity
-    sampling: Sampling
-    guide: ValueGrid | None
+    similarity: Similarity  # the way back to world coordinates
+    sampling: Sampling  # where its rays are sampled
+    guide: ValueGrid | None  # SDF grid by which they are, or None
 
     def paint(self, camera: Camera, level: int = -1) -> Image:
         """What a camera, in unit-sphere coordinates, sees; as photographs of the usual exposure show it."""
@@ -48,11 +39,7 @@ class TrainedScene(NamedTuple):
 
 
 def open_scene(run: str | Path, *, device: torch.device | str = "cpu") -> TrainedScene:
-    """Load what `reconstruct` has left in a run directory.
-
-    Args:
-        run: the directory, or the field in it.
-        device: where to put it.
+    """Load what `reconstruct` has left in a run directory, or beside the field in it.
 
     Raises:
         InputError: there is no such run, it is damaged, or it keeps no colours by direction.
@@ -84,19 +71,10 @@ def photograph(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> str:
-    """Render a reconstruction as its photographs show it: highlights move with the eye, and what is behind is there.
+    """Render a finished reconstruction as its photographs show it → what was drawn, in a few words.
 
-    Args:
-        run: the directory of a finished `reconstruct`.
-        out: see `render_run`, as for all that follows.
-        options: from where, how large, and which level; the background is the scene's.
-        progress: called with how many parts are drawn, and of how many.
-
-    Returns:
-        What was drawn, in a few words.
-
-    Raises:
-        InputError: see `open_scene` and `render_run`.
+    Highlights move with the eye, and the background is the scene's. Arguments and errors are those of `render_run`, and
+    errors of `open_scene`.
     """
     options = dataclasses.replace(options or RenderOptions(), shading=None)
     scene = open_scene(run, device=choose_device(options.device))

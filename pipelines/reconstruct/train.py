@@ -1,14 +1,11 @@
-"""``reconstruct``: from posed photographs to a surface with colours, by volume rendering (NeuS) of a multiscale SDF.
-
-Colours are learnt by direction; at the end a texture learns those that most cameras see, which every other command can
-use.
-"""
+"""``reconstruct``: from posed photographs to a surface with colours, by volume rendering (NeuS) of a multiscale SDF."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,30 +22,30 @@ from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
 from ..render.picture import Image, picture_bytes, write_picture
 from ..surface.surface import in_region, sample_points, thinned
 from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
-from ..training.budget import BUDGET, Budget
 from ..training.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
-from ..training.machine import choose_device, environment
-from ..training.report import Progress, Report, reported, silent
+from ..training.machine import choose_device
+from ..training.progress import Progress, Report, reported, silent
 from ..training.result import Run
+from ..training.scaffold import BUDGET, Budget, Training
 from ..training.settings import ReconstructConfig, TextureConfig
 from ..training.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
-from .data.measured import MeasuredDepths
-from .data.silhouettes import Agreement
-from .data.visibility import seen_points
-from .initialisation.hull import begin
-from .model.model import RayPool, SceneModel, build_scene
-from .model.replayed import ReplayedTrainer, scene_trainer
-from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread
-
-__all__ = [
-    "HELD_OUT_FILE",
-    "MESH_FILE",
-    "PREVIEW_FILE",
-    "Reconstruction",
-    "reconstruct",
-    "scene_texture",
-    "surface_colors",
-]
+from .hull import begin
+from .measured import MeasuredDepths
+from .model import RayPool, SceneModel, build_scene
+from .objective import ReplayedTrainer, scene_trainer
+from .silhouettes import Agreement
+from .views import (
+    SeenFrom,
+    ViewImage,
+    comparison_sheet,
+    exposed_as,
+    held_out,
+    measure,
+    reduced,
+    render_image,
+    seen_points,
+    spread,
+)
 
 HELD_OUT_FILE = "held_out.png"
 PREVIEW_FILE = "preview.png"
@@ -70,8 +67,12 @@ class FinishOptions:
     most_views: int = 9  # the same at most
     facing: float = 0.5  # cosine within which they face it
     darker: float = 0.25  # which of their colours it is, as a quantile from dark to light
-    after_share: float = 0.15  # share of a time budget for what comes after the training, at most
+    after_share: float = 0.15  # share of a time budget for held-out views and the texture, at most
+    surface_share: float = 0.5  # the same for what photographs see of the surface, and its meshes
     timed_pixels: int = 1024  # of the picture by which its time is estimated
+    timed_resolution: int = 32  # of the mesh by which the time of meshes is estimated, whose cost grows with its square
+    mesh_resolution: int = 256  # of the mesh that the command makes of a finished run
+    traced_views: int = 30  # views whose cost `seen_points` does not exceed
     texture_factor: float = 2.0  # time of the texture, surface and samples included, over that of its steps
 
 
@@ -120,7 +121,7 @@ def reconstruct(
     """
     started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config = folder.config(ReconstructConfig, config)
-    device = choose_device(config.device)
+    choose_device(config.device)  # refused before the pictures are read
     budget = Budget(config.time_budget, started=started)
     with reported(progress, "reading the pictures"):
         maps = None if config.depth_maps is None else Path(config.depth_maps)
@@ -131,29 +132,28 @@ def reconstruct(
             else read_posed_images(data, width=config.width, depths=depths, allow_missing=config.allow_missing)
         )
     load_compiler()
-    training = _Reconstruction(images, config, device, folder, progress or silent, budget, resume=resume)
+    training = _Reconstruction(images, config, folder, progress or silent, budget, resume=resume)
     with folder.writing(HELD_OUT_FILE, PREVIEW_FILE, MESH_FILE):
         if resume:
             training.restore()
         return training.run()
 
 
-class _Reconstruction:
+class _Reconstruction(Training[ReconstructConfig, Field]):
     """One reconstruction under way."""
 
     def __init__(
         self,
         images: PosedImages,
         config: ReconstructConfig,
-        device: torch.device,
         folder: RunFolder,
         report: Report,
         budget: Budget,
         *,
         resume: bool,
     ) -> None:
-        self.images, self.config, self.device = images, config, device
-        self.folder, self.report, self.budget = folder, report, budget
+        super().__init__(config, folder, budget, report)
+        self.images, self.similarity, device = images, images.similarity, self.device
         self.train_views, self.test_views = held_out(images.views, config.test_every)
         has_masks = all(view.mask is not None for view in self.train_views)
         agreement = Agreement.of(self.train_views, images.similarity) if has_masks else None
@@ -172,23 +172,32 @@ class _Reconstruction:
                 "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured, agreement)
             )
         self.trainer = scene_trainer(self.model, pool, config, measured=self.measured)
-        self.trainer.seconds = self.training_seconds()
         # Of the training pixels, their masks, the cameras and what was measured.
         seen = [pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks])]
         if self.measured is not None:
             seen += [self.measured.along, self.measured.numbers]
         self.fingerprint = digest_of(tensor.cpu().numpy() for tensor in seen)
         self.shown = 0
+        self.reserved = 0.0  # seconds of the time budget for the surface, which comes after the training
 
     def training_seconds(self) -> float | None:
-        """How long the training may take within the time budget: all but what comes after it, which is held short."""
+        """How long the training may take within the time budget: all but what comes after it.
+
+        The surface's part of that cannot be shortened; held-out views and the texture can.
+        """
         left = self.budget.left()
         if left is None:
             return None
-        after = self.after_seconds(left)
-        return max((self.budget.left() or 0.0) - min(after, FINISH.after_share * left), BUDGET.least_seconds)
+        self.reserved = min(self.surface_seconds(), FINISH.surface_share * left)
+        after = min(self.picture_seconds(left), FINISH.after_share * left)
+        return max((self.left() or 0.0) - after, BUDGET.least_seconds) + self.elapsed
 
-    def after_seconds(self, left: float) -> float:
+    def left(self) -> float | None:
+        """Seconds left but for the surface; None without a budget."""
+        left = self.budget.left()
+        return None if left is None else max(left - self.reserved, 0.0)
+
+    def picture_seconds(self, left: float) -> float:
         """Seconds for the held-out views and the texture, from the time of a small picture and a few steps."""
         seconds, views = 0.0, self.test_views
         if views:
@@ -201,6 +210,22 @@ class _Reconstruction:
             seconds += FINISH.texture_factor * self.config.texture_steps * step
         return seconds
 
+    def surface_seconds(self) -> float:
+        """Seconds for what photographs see of the surface, and for its meshes, from one view and a coarse mesh."""
+        started = time.monotonic()
+        seen_points(self.model.geometry, self._sights()[:1])
+        traced = time.monotonic()
+        with suppress(NoSurfaceError):
+            extract_mesh(self.model.geometry, resolution=FINISH.timed_resolution)
+        meshed = time.monotonic() - traced
+        cells = FINISH.mesh_resolution**2 + FINISH.texture_resolution**2 * bool(self.config.texture_steps)
+        views = min(len(self.train_views), FINISH.traced_views)
+        return (traced - started) * views + meshed * cells / FINISH.timed_resolution**2
+
+    def _sights(self) -> list[SeenFrom]:
+        """The cameras that were trained on, in unit-sphere coordinates, and their masks."""
+        return [(view.camera.moved(self.similarity), view.mask) for view in self.train_views]
+
     @property
     def level(self) -> int:
         """The finest level that is switched on by now."""
@@ -209,7 +234,8 @@ class _Reconstruction:
     def run(self) -> Reconstruction:
         """Train to the end, measure, colour, write."""
         with stop_on_signals() as flag:
-            if not self.trainer.run(flag, report=self._report, save=self._save):
+            self.trainer.seconds = self.training_seconds()
+            if not self.take_steps(self.trainer, flag, lambda: self.model.geometry, self._report):
                 raise Interrupted(self.folder.out)
             # What was trained is safe before pictures and texture are made, which may be interrupted or fail too.
             self._save()
@@ -219,10 +245,9 @@ class _Reconstruction:
     def _finish(self) -> Reconstruction:
         """Measure, colour, write."""
         pairs = self._render_held_out()
-        record = self._record(finished=True) | {"held_out": self._figures(pairs)}
+        record = self.record(finished=True) | {"held_out": self._figures(pairs)}
         with reported(self.report, "what photographs see"):
-            views = [(view.camera.moved(self.images.similarity), view.mask) for view in self.train_views]
-            points, within = seen_points(self.model.geometry, views)
+            points, within = seen_points(self.model.geometry, self._sights())
             if len(points):
                 self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), seen_within=within))
         self.model.cpu()
@@ -265,7 +290,7 @@ class _Reconstruction:
         return image if self.model.exposures is None else exposed_as(image, view, self.model.background)
 
     def _render_held_out(self) -> list[tuple[PosedImage, ViewImage]]:
-        pairs, count, limit = [], len(self.test_views), self.budget.left()
+        pairs, count, limit = [], len(self.test_views), self.left()
         begun = time.monotonic()
         if self.trainer.objective.grid is not None:
             self.trainer.objective.grid.refresh(self.model.geometry)
@@ -299,9 +324,7 @@ class _Reconstruction:
         if self.config.texture_steps == 0:
             return None, None
         try:
-            fitted = scene_texture(
-                self.model, self.images, self.config, progress=self.report, seconds=self.budget.left()
-            )
+            fitted = scene_texture(self.model, self.images, self.config, progress=self.report, seconds=self.left())
         except NoSurfaceError as error:
             raise InputError(
                 f"{self.images.source}: the training found no surface ({error}); see `mplicits check-cameras`, "
@@ -312,25 +335,18 @@ class _Reconstruction:
         return fitted.texture, fitted.record
 
     def _save(self) -> None:
-        """Write a usable field and all that `restore` needs."""
-        trainer = self.trainer
-        progress = {
-            "fingerprint": self.fingerprint,
-            "shown": self.shown,
-            "losses": trainer.losses,
-            "start": self.start,
-        }
-        record = self._record(finished=False)
-        self.folder.save(self.model.geometry, self.images.similarity, record, trainer.state(), progress)
+        self.save(self.model.geometry, self.trainer)
+
+    def kept(self) -> dict[str, Any]:
+        """See `Training.kept`."""
+        return {"shown": self.shown, "losses": self.trainer.losses, "start": self.start}
 
     def restore(self) -> None:
-        """Take up an interrupted run; see `RunFolder.restore`."""
-        path, source = self.folder.path, self.images.source
-        mismatch = f"{source}: not the pictures that {path} was trained on; resume with those"
-        tensors, progress = self.folder.restore(self.fingerprint, mismatch)
+        """Take up an interrupted run."""
+        mismatch = f"{self.images.source}: not the pictures that {self.folder.path} was trained on; resume with those"
+        _, progress = self.restored(mismatch)
         self.start = progress.get("start", self.start)
         self.shown, self.trainer.losses = progress["shown"], progress["losses"]
-        self.trainer.restore(tensors)
 
     def _by_view(self, names: tuple[str, str], found: tuple[Tensor, Tensor]) -> dict[str, dict[str, list[float]]]:
         """What was learnt of each photograph, three numbers each."""
@@ -338,19 +354,17 @@ class _Reconstruction:
         views = [view.name for view in self.train_views]
         return {view: {name: row[k] for name, row in zip(names, rows, strict=True)} for k, view in enumerate(views)}
 
-    def _record(self, *, finished: bool) -> dict[str, Any]:
+    def record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
         model, trainer = self.model, self.trainer
         parts = {"geometry": model.geometry, "color": model.color}
         return {
-            "finished": finished,
             "data": str(self.images.source),
             "reading": self.images.reading,
             "views": {"trained": len(self.train_views), "held_out": len(self.test_views)},
             "region": self.images.region,
             "start": self.start,
-            "similarity": dataclasses.asdict(self.images.similarity),
-            "config": dataclasses.asdict(self.config),
+            **self.common_record(finished=finished),
             "parameters": {name: parameter_count(part) for name, part in parts.items()},
             "deltas": model.geometry.deltas.tolist(),
             **({} if model.exposures is None else {"exposures": self._by_view(("gain", "offset"), model.exposures())}),
@@ -362,24 +376,17 @@ class _Reconstruction:
             "steps": trainer.step,
             "training_seconds": round(trainer.elapsed, 3),
             **({"replayed": trainer.facts()} if isinstance(trainer, ReplayedTrainer) else {}),
-            **self.budget.record(),
             "losses": trainer.losses,
-            "environment": environment(self.device),
         }
 
 
 @torch.no_grad()
 def surface_colors(model: SceneModel, points: Tensor, eyes: Tensor) -> Tensor:
-    """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface, as cameras that face them see them, but for highlights.
+    """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface, as cameras at ``eyes`` ``(V, 3)`` see them.
 
-    The lower quartile, for each channel, of what up to nine cameras see whose rays are within 60° of the normal:
-    paint is the same for all of them, and a highlight, which up to half of them may see, only adds light. Where fewer
-    than three face it, the colour along the normal.
-
-    Args:
-        model: trained.
-        points: ``(N, 3)``.
-        eyes: ``(V, 3)`` of the cameras, in unit-sphere coordinates; in an order in which the first ones are all around.
+    The lower quartile, for each channel, of what up to nine cameras see whose rays are within 60° of the normal: a
+    highlight, which up to half of them may see, only adds light. Where fewer than three face it, the colour along the
+    normal. All in unit-sphere coordinates; the first eyes should be all around.
     """
     parts = []
     for part in points.split(FINISH.batch):
@@ -409,14 +416,7 @@ def scene_texture(
     progress: Report | None = None,
     seconds: float | None = None,
 ) -> FittedTexture:
-    """Train a `TextureField` on the colours of a scene's surface; see `surface_colors`.
-
-    Args:
-        model: trained, on the CPU.
-        images: of it; for the cameras, the coordinates and the name.
-        config: the reconstruction's; ``texture_steps``, seed and device are used.
-        progress: see `fit_texture`.
-        seconds: a time budget; None for none.
+    """Train a `TextureField` on the colours of a scene's surface, see `surface_colors`, in so many ``seconds``.
 
     Raises:
         NoSurfaceError: the geometry has no surface.

@@ -15,60 +15,31 @@ from torch import Tensor
 
 from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImage, resample, shrink
-from ...neural_fields import Similarity
+from ...neural_fields import Field, Mesh, Similarity, sphere_trace
 from ...neural_fields.volume.render import Sampling
 from ...neural_fields.volume.weights import sphere_span
 from ..render.picture import Image, stacked
-from .data.silhouettes import OBJECT
-from .model.model import SceneModel, camera_rays
-
-__all__ = [
-    "ViewImage",
-    "comparison_sheet",
-    "exposed_as",
-    "held_out",
-    "measure",
-    "reduced",
-    "render_camera",
-    "render_image",
-    "spread",
-    "target_of",
-]
+from ..render.rasterise import mesh_view
+from ..render.studio import sees
+from .model import SceneModel, camera_rays
+from .silhouettes import OBJECT
 
 Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class ViewImage:
-    """A rendered view.
+    """A rendered view."""
 
-    Attributes:
-        color: ``(H, W, 3)`` display RGB in [0, 1].
-        normal: ``(H, W, 3)`` in unit-sphere coordinates; shorter than 1 where the view passes the object.
-        opacity: ``(H, W)``.
-    """
-
-    color: Float32
-    normal: Float32
-    opacity: Float32
+    color: Float32  # (H, W, 3) display RGB in [0, 1]
+    normal: Float32  # (H, W, 3) in unit-sphere coordinates; shorter than 1 where the view passes the object
+    opacity: Float32  # (H, W)
 
 
 def render_image(
-    model: SceneModel,
-    view: PosedImage,
-    similarity: Similarity,
-    sampling: Sampling,
-    **options: Any,
+    model: SceneModel, view: PosedImage, similarity: Similarity, sampling: Sampling, **options: Any
 ) -> ViewImage:
-    """Render a view with the model's volume renderer.
-
-    Args:
-        model: on any device.
-        view: whose camera it is.
-        similarity: from world to unit-sphere coordinates.
-        sampling: where to sample.
-        options: of `render_camera`.
-    """
+    """`render_camera` of a view whose camera is in world coordinates; ``options`` are its."""
     return render_camera(model, view.camera.moved(similarity), sampling, **options)
 
 
@@ -84,17 +55,10 @@ def render_camera(
     guide: Callable[[Tensor], Tensor] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ViewImage:
-    """Render what a camera sees with the model's volume renderer, a ray through the middle of each pixel.
+    """What a camera in unit-sphere coordinates sees by volume rendering, a ray through the middle of each pixel.
 
-    Args:
-        model: on any device.
-        camera: in unit-sphere coordinates.
-        sampling: where to sample.
-        level: of the geometry.
-        least_weight: see `render_volume`.
-        skip: the same.
-        guide: the same.
-        progress: told (rays done, rays in all).
+    ``least_weight``, ``skip`` and ``guide`` are those of `SceneModel.render`; ``progress`` is told (rays done, rays in
+    all).
     """
     device = model.background.device
     origins, directions = (part.to(device) for part in camera_rays(camera))
@@ -106,13 +70,7 @@ def render_camera(
     done = 0
     for rows in asked.split(4096):
         seen = model.render(
-            origins[rows],
-            directions[rows],
-            sampling,
-            level=level,
-            least_weight=least_weight,
-            skip=skip,
-            guide=guide,
+            origins[rows], directions[rows], sampling, level=level, least_weight=least_weight, skip=skip, guide=guide
         )
         color[rows], normal[rows], opacity[rows] = seen.color, seen.normal, seen.opacity
         done += len(rows)
@@ -127,10 +85,7 @@ def render_camera(
 
 
 def held_out(views: Sequence[PosedImage], every: int) -> tuple[list[PosedImage], list[PosedImage]]:
-    """Split views into those to train on and those held out: every n-th one, from the first; none for 0.
-
-    At least one view is trained on, so of a single view none is held out.
-    """
+    """The views to train on, and those held out: every n-th, from the first; none for 0, and none of a single view."""
     if every == 0 or len(views) == 1:
         return list(views), []
     chosen = set(range(0, len(views), max(2, every)))
@@ -147,11 +102,9 @@ def spread(views: Sequence[PosedImage]) -> list[PosedImage]:
 
 def reduced(view: PosedImage, pixels: int) -> PosedImage:
     """A view in about so many pixels, in linear light; as it is, if it has no more."""
-    camera = view.camera
-    share = math.sqrt(pixels / (camera.width * camera.height))
-    if share >= 1:
+    small = _coarse(view.camera, pixels)
+    if small is view.camera:
         return view
-    small = camera.resized(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
     step = partial(shrink, width=small.width, height=small.height)
     mask = None if view.mask is None else step(view.mask)
     return PosedImage(view.name, small, resample(view.color, None, step)[0], mask)
@@ -192,10 +145,7 @@ def measure(image: ViewImage, view: PosedImage, background: Tensor) -> dict[str,
 
     target = target_of(view, background)
     ours, theirs = (torch.from_numpy(picture).permute(2, 0, 1)[None] for picture in (image.color, target))
-    figures = {
-        "psnr": float(psnr(ours, theirs, 1.0)),
-        "ssim": float(ssim(ours, theirs, 11).mean()),
-    }
+    figures = {"psnr": float(psnr(ours, theirs, 1.0)), "ssim": float(ssim(ours, theirs, 11).mean())}
     if view.mask is not None and bool((view.mask > OBJECT).any()):
         inside = torch.from_numpy(view.mask > OBJECT)
         figures["psnr_object"] = float(psnr(ours[0, :, inside], theirs[0, :, inside], 1.0))
@@ -217,3 +167,78 @@ def _enlarged(picture: Image, least: int = 600) -> Image:
     """Small pictures in whole multiples of their size, so that their pixels can be seen."""
     factor = max(1, least // picture.shape[1])
     return picture.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+SeenFrom = tuple[Camera, NDArray[np.float32] | None]
+"""A camera in unit-sphere coordinates, and the mask ``(H, W)`` of its picture, which says what is object."""
+
+
+@torch.no_grad()
+def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]:
+    """Points ``(N, 3)`` of the surface that two photographs see at least, on the CPU, and the distance of neighbours.
+
+    Every view is traced in up to 10,000 pixels of what its mask calls object, and all together in 300,000. Places are
+    told apart that are 1/32 of a radius apart, or as far as neighbouring pixels on a surface that is seen obliquely.
+    ``views`` are cameras in the field's unit-sphere coordinates, and masks if there are any.
+    """
+    pixels = max(1, min(300_000 // len(views), 10_000))
+    points: list[Tensor] = []
+    owners: list[Tensor] = []
+    pitches: list[Tensor] = []
+    for number, (whole, mask) in enumerate(views):
+        camera = _coarse(whole, pixels)
+        eye, directions = camera.rays(device=field.like.device)
+        asked = torch.ones(directions.shape[:2], dtype=torch.bool)
+        if mask is not None:
+            asked = torch.from_numpy(shrink(mask, camera.width, camera.height) > OBJECT)
+        rays = directions[asked.to(directions.device)].to(field.like)
+        eyes = eye.to(rays).expand_as(rays)
+        hits = sphere_trace(field, eyes, rays, tolerance=1e-3, resolution=1e-3, radius=1.0)
+        found = hits.position[hits.mask].cpu().double()
+        points.append(found)
+        owners.append(torch.full((len(found),), number))
+        pitches.append(hits.depth[hits.mask].cpu().double() / float(camera.intrinsics[0, 0]))
+    every = torch.cat(points)
+    if not len(every):
+        return every, math.inf
+    within = 2 * float(np.median(torch.cat(pitches)))
+    cells = ((every + 1) / max(1 / 32, within)).floor().long()
+    across = 1 + int(cells.max())
+    place = (cells[:, 0] * across + cells[:, 1]) * across + cells[:, 2]
+    # A view counts once in a place, however many of its pixels see it.
+    pairs = torch.unique(place * len(views) + torch.cat(owners))
+    known, count = torch.unique(pairs // len(views), return_counts=True)
+    # What one view alone sees, it cannot measure.
+    return every[torch.isin(place, known[count >= min(2, len(views))])], within
+
+
+def _coarse(camera: Camera, pixels: int) -> Camera:
+    """A camera in about so many pixels; as it is, if it has no more."""
+    share = math.sqrt(pixels / (camera.width * camera.height))
+    return camera if share >= 1 else _scaled(camera, share)
+
+
+def _scaled(camera: Camera, share: float) -> Camera:
+    return camera.resized(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
+
+
+def count_views(
+    cameras: Sequence[Camera],
+    surface: Mesh,
+    points: NDArray[np.float64],
+    *,
+    finest: int = 1024,
+    progress: Callable[[int, int], None] | None = None,
+) -> NDArray[np.int64]:
+    """How many cameras ``(N,)`` see points ``(N, 3)`` of a surface: in their picture, with nothing before them.
+
+    ``finest`` pixels of the longer side decide what hides what. Ten of them wide is the strip beyond a rim that may
+    count as seen. ``progress`` is called with ``(done, total)`` after every camera.
+    """
+    counts = np.zeros(len(points), dtype=np.int64)
+    for index, camera in enumerate(cameras):
+        large = _scaled(camera, finest / max(camera.width, camera.height))
+        counts += sees(large, mesh_view(surface, large), points)
+        if progress is not None:
+            progress(index + 1, len(cameras))
+    return counts

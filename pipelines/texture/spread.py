@@ -1,10 +1,8 @@
-"""Colours of a surface at places off it, without a jump: the further away, the wider they are averaged.
+"""Colours at places off a surface, without a jump: the further away, the wider they are averaged.
 
-The nearest point of a surface jumps where a place has two, so colours looked up there tear. Here samples of a surface
-are counted into the cells of a lattice, and cells into cells of twice the size (pull); where a lattice has no samples,
-the coarser one says what it sees (push), after the pull-push of Gortler et al., "The Lumigraph" (1996). A place at
-distance r looks at the lattices whose cells are about r wide, linearly in space and in log r, so that what it finds has
-no jumps.
+Samples are counted into the cells of a lattice, and cells into cells of twice the size (pull); where one has no
+samples, the coarser one fills in (push), after Gortler et al., "The Lumigraph" (1996). A place at distance r takes the
+lattices whose cells are about r wide, linearly in space and in log r.
 """
 
 from __future__ import annotations
@@ -13,18 +11,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, grid_sample, interpolate
 
-__all__ = ["CELL", "SpreadColors"]
-
 SPREAD_CELLS = 128  # cells on each side of the cube [-1, 1]³
 CELL = 2.0 / SPREAD_CELLS
 
 
 class SpreadColors:
-    """Colours in space, from samples of a surface.
-
-    Args:
-        points: ``(N, 3)`` of the surface, in the cube from −1 to 1; what lies outside counts in its outermost cells.
-        colors: ``(N, C)``, any values.
+    """Colours in space, from ``colors`` ``(N, C)`` at ``points`` ``(N, 3)`` of a surface in the cube from −1 to 1.
 
     Raises:
         ValueError: there are no samples.

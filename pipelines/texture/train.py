@@ -4,54 +4,148 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets import PointCloud
+from ...datasets import PointCloud, read_cloud
+from ...datasets.textured.reading import TEXTURED_READERS, read_textured, sample_textured
 from ...neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture
 from ...neural_fields.backend.devices import upload
-from ...neural_fields.backend.files import write_whole
+from ...neural_fields.backend.files import damage, write_whole
 from ...neural_fields.checkpoint import texture_bytes
 from ...neural_fields.fields.losses import color_loss, tangential_loss
 from ...neural_fields.networks.texture import ColorSiren
 from ...neural_fields.spacetime.dynamic_tracing import moment
-from ..training.atomic import prune
-from ..training.budget import BUDGET, Budget, affordable, step_seconds
-from ..training.config import load_config
+from ..fit.samples import DOMAIN
 from ..training.folder import (
     TEXTURE_FILE,
+    RunFolder,
     chosen_level,
     digest_of,
     find_field,
     load_state,
+    locked,
+    prune,
     save_state,
     texture_state_file,
     write_texture,
 )
-from ..training.lock import locked
-from ..training.machine import choose_device, environment
-from ..training.report import Report, reported
+from ..training.progress import Report, reported, silent
 from ..training.result import Run
-from ..training.settings import TextureConfig
+from ..training.scaffold import BUDGET, Budget, Training, affordable, step_seconds
+from ..training.settings import TextureConfig, load_config
 from ..training.trainer import Group, Objective, Trainer, parameter_count, seeded, stop_on_signals, warm_cosine
-from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
-__all__ = [
-    "FittedTexture",
-    "TextureObjective",
-    "default_delta",
-    "fit_texture",
-    "texture_of",
-    "texture_run",
-    "texture_step_seconds",
-]
+
+class ColorSamples(NamedTuple):
+    """Points of the band with known colours."""
+
+    points: Tensor  # (N, 3) in unit-sphere coordinates
+    colors: Tensor  # (N, 3) display RGB
+    left_out: int  # how many points of the cloud were outside the band, or not finite
+
+
+class BandSamples(NamedTuple):
+    """Points of the band with the direction along which the colour shall not change."""
+
+    points: Tensor  # (M, 3) in unit-sphere coordinates
+    gradients: Tensor  # (M, 3) ∇f there
+
+
+def read_colors(path: str | Path, *, samples: int, seed: int, columns: str | None = None) -> PointCloud:
+    """Read a cloud with colours; a mesh gives so many ``samples``, with the colours of its texture or its vertices.
+
+    Raises:
+        InputError: the file cannot be read, or has no colours.
+    """
+    path = Path(path)
+    if path.suffix.lower() in TEXTURED_READERS and _has_faces(path):
+        return sample_textured(read_textured(path), samples, seed=seed)
+    cloud = read_cloud(path, columns=columns)
+    if cloud.colors is None:
+        raise InputError(f"{path}: colors: there are none; export the points with their colours, or name a mesh")
+    return cloud
+
+
+def has_colors(path: str | Path, columns: str | None = None) -> bool:
+    """Whether `read_colors` would find colours in the file of a cloud or mesh; InputError if it cannot be read."""
+    path = Path(path)
+    cloud = read_cloud(path, columns=columns)
+    if path.suffix.lower() in TEXTURED_READERS and _has_faces(path):
+        return TEXTURED_READERS[path.suffix.lower()](path).has_colors
+    return cloud.colors is not None
+
+
+def _has_faces(path: Path) -> bool:
+    """Whether a file is a mesh; one that does not exist is left to whoever reads it."""
+    extension = path.suffix.lower()
+    if extension not in (".ply", ".obj") or not path.is_file():
+        return True
+    with path.open("rb") as file:
+        if extension == ".obj":
+            return any(line.lstrip().startswith(b"f ") for line in file)
+        header = file.read(1 << 16).split(b"end_header", 1)[0]
+        return re.search(rb"element\s+face\s+0*[1-9]", header) is not None
+
+
+@torch.no_grad()
+def match_colors(
+    cloud: PointCloud, geometry: Field, similarity: Similarity, *, level: int, delta: float
+) -> ColorSamples:
+    """The points of a cloud in input coordinates that lie in the band |f| < ``delta``, in the field's coordinates.
+
+    Raises:
+        InputError: there are no colours, or most of the points are not near the surface: another shape or scale.
+    """
+    if cloud.colors is None:
+        raise InputError(f"{cloud.source}: colors: there are none; export the points with their colours")
+    finite = np.isfinite(cloud.points).all(axis=1)
+    unit = similarity.to_unit(cloud.points[finite])
+    distances = _distances(unit, geometry, level=level)
+    inside = distances < delta
+    # With fewer points in the band, the colours are those of something else.
+    if inside.mean() < 0.5:
+        far, near = np.median(distances) * similarity.scale, delta * similarity.scale
+        raise InputError(
+            f"{cloud.source}: points: {inside.mean():.0%} of them lie within {near:.3g} of the surface of the run, "
+            f"half are further off than {far:.3g} (input units); give the shape that was fitted, in the same "
+            "coordinates, or widen the band (--delta)"
+        )
+    like = geometry.like
+    points = torch.from_numpy(unit[inside]).to(like)
+    colors = torch.from_numpy(cloud.colors[finite][inside]).to(like)
+    return ColorSamples(points, colors, len(cloud) - len(points))
+
+
+def _distances(unit: NDArray[np.float64], geometry: Field, *, level: int) -> NDArray[np.float64]:
+    """|f|, and beyond the cube in which fields are trained the way back into it as well → ``(N,)``."""
+    clamped = unit.clip(-DOMAIN, DOMAIN)
+    points = torch.from_numpy(clamped).to(geometry.like)
+    values = torch.cat([geometry.value(part, level=level).abs() for part in points.split(1 << 17)])
+    return values.double().cpu().numpy() + np.linalg.norm(unit - clamped, axis=1)
+
+
+@torch.no_grad()
+def band_directions(
+    samples: ColorSamples, geometry: Field, count: int, *, level: int, delta: float, generator: torch.Generator
+) -> BandSamples:
+    """``count`` points moved by U(−δ, δ) along each axis, those that stay in the band, with ∇f."""
+    index = torch.randint(len(samples.points), (count,), generator=generator)
+    shift = (2 * torch.rand(count, 3, generator=generator) - 1) * delta
+    points = samples.points[index.to(samples.points.device)] + shift.to(samples.points)
+    jets = [geometry.jet(part, level=level) for part in points.split(1 << 17)]
+    kept = (torch.cat([jet.value for jet in jets]).abs() < delta).nonzero()[:, 0]
+    return BandSamples(points[kept], torch.cat([jet.gradient for jet in jets])[kept])
+
 
 # A band at least this wide (in units of the field) holds decimated meshes, and the surfaces of small networks.
 LEAST_DELTA = 0.02
@@ -87,14 +181,11 @@ def fit_texture(
     similarity: Similarity | None = None,
     level: int = -1,
     progress: Report | None = None,
-    save: Callable[[dict[str, Tensor]], None] | None = None,
-    state: Mapping[str, Tensor] | None = None,
     started: float | None = None,
 ) -> FittedTexture:
     """Train a texture field by the paper's 𝒯(φ): the colours at points, and none of their change along ∇f.
 
-    The geometry is frozen, so ∇f is evaluated once for a pool of points of the band; a step evaluates the texture
-    network only. Ctrl-C ends the training early and leaves what has been learnt.
+    The geometry is frozen. Ctrl-C ends the training early and leaves what has been learnt.
 
     Args:
         geometry: f.
@@ -103,8 +194,6 @@ def fit_texture(
         similarity: from input to the geometry's coordinates; the identity if there is none.
         level: the level of the geometry that the colours belong to.
         progress: called now and then with how far the training is.
-        save: called now and then, and when the training is interrupted, with what ``state`` takes.
-        state: of an interrupted training of the same cloud and settings, to be continued to the same result.
         started: when the time budget began, by `time.monotonic`; None is now.
 
     Raises:
@@ -117,71 +206,105 @@ def fit_texture(
         >>> run = fit("scan.ply")  # doctest: +SKIP
         >>> fit_texture(run.field, read_cloud("scan.ply"), similarity=run.similarity)  # doctest: +SKIP
     """
-    started = time.monotonic() if started is None else started
     config, similarity = config or TextureConfig(), similarity or Similarity.identity()
-    device = choose_device(config.device)
-    level = geometry.resolve_level(level)
-    delta = config.delta or default_delta(geometry)
-    budget, band_samples = Budget(config.time_budget, started=started), config.samples // 2
-    home = geometry.like.device
-    geometry = geometry.to(device)
+    budget = Budget(config.time_budget, started=started)
+    return _Texturing(geometry, cloud, config, similarity, level, budget, progress or silent).run()
 
-    def made(cloud: PointCloud, band_samples: int) -> tuple[ColorSamples, BandSamples]:
-        generator.manual_seed(config.seed)
-        samples = match_colors(cloud, geometry, similarity, level=level, delta=delta)
-        return samples, band_directions(samples, geometry, band_samples, level=level, delta=delta, generator=generator)
 
-    def part(count: int) -> tuple[PointCloud, int]:
-        """So many of the points, and as large a part of the band's."""
-        share = count / max(len(cloud), 1)
-        return _thinned(cloud, share, config.seed), max(int(share * band_samples), FEWEST_COLORED)
+class _Texturing(Training[TextureConfig, Field]):
+    """One texture under way; ``save`` writes the state of its trainer, for ``trainer_state`` of the next process."""
 
-    generator = torch.Generator()
-    with reported(progress, "texture: samples"):
-        left = budget.left()
-        if left is not None:
-            seconds = BUDGET.sampling_share * left
-            count = affordable(lambda count: made(*part(count)), len(cloud), seconds, fewest=FEWEST_COLORED)
-            if count < len(cloud):
-                cloud, band_samples = part(count)
-                note = f"learns from {len(cloud):,} points and {band_samples:,} of the band, for want of time"
-                budget.notes.append(note)
-        samples, band = made(cloud, band_samples)
-        mean = samples.colors.mean(dim=0).tolist()
-        with seeded(config.seed):
-            network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean).to(samples.points)
-    sampling_seconds = time.monotonic() - started
-    left, seconds = budget.left(), None
-    if left is not None and config.time_budget is not None:
-        # The steps get a tenth of a time budget in any case.
-        seconds = max(left, 0.1 * config.time_budget)
-    objective = TextureObjective(network, samples, band, config, delta=delta, generator=generator)
-    trainer = Trainer(objective, stage="texture", steps=config.steps, seconds=seconds)
-    if state is not None:
-        trainer.restore(state)
-    with stop_on_signals() as flag:
-        finished = trainer.run(flag, report=progress, save=None if save is None else lambda: save(trainer.state()))
-    record = {
-        "finished": finished,
-        "source": cloud.source,
-        "level": level,
-        "delta": delta,
-        "points": len(samples.points),
-        "left_out": samples.left_out,
-        **budget.record(),
-        "parameters": parameter_count(network),
-        "steps": trainer.step,
-        "sampling_seconds": round(sampling_seconds, 3),
-        "training_seconds": round(trainer.elapsed, 3),
-        "losses": trainer.losses,
-        "psnr_at_points": _psnr(network, samples, generator),
-        "config": dataclasses.asdict(config),
-        "environment": environment(device),
-    }
-    network.requires_grad_(False)
-    texture = TextureField(geometry.to(home), network.to(home), delta=delta, geometry_level=level, outside=mean)
-    texture = texture.to(home)
-    return FittedTexture(texture.geometry, similarity or Similarity.identity(), None, record, texture)
+    def __init__(
+        self,
+        geometry: Field,
+        cloud: PointCloud,
+        config: TextureConfig,
+        similarity: Similarity,
+        level: int,
+        budget: Budget,
+        report: Report,
+        keep: Callable[[dict[str, Tensor]], None] | None = None,
+    ) -> None:
+        super().__init__(config, RunFolder(None), budget, report)
+        self.home, self.geometry = geometry.like.device, geometry.to(self.device)
+        self.cloud, self.similarity, self.keep = cloud, similarity, keep
+        self.level = geometry.resolve_level(level)
+        self.delta = config.delta or default_delta(geometry)
+        self.generator = torch.Generator()
+
+    def run(self) -> FittedTexture:
+        config = self.config
+        with reported(self.report, "texture: samples"):
+            cloud, band_samples = self.affordable()
+            self.samples, band = self.made(cloud, band_samples)
+            mean = self.samples.colors.mean(dim=0).tolist()
+            with seeded(config.seed):
+                network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean)
+            self.network = network.to(self.samples.points)
+        self.sampling_seconds = time.monotonic() - self.budget.started
+        left, seconds = self.budget.left(), None
+        if left is not None and config.time_budget is not None:
+            seconds = max(left, 0.1 * config.time_budget)  # the steps get a tenth in any case
+        objective = TextureObjective(
+            self.network, self.samples, band, config, delta=self.delta, generator=self.generator
+        )
+        self.trainer = Trainer(objective, stage="texture", steps=config.steps, seconds=seconds)
+        with stop_on_signals() as flag:
+            finished = self.take_steps(self.trainer, flag, lambda: self.geometry)
+        record = self.record(finished=finished)
+        self.network.requires_grad_(False)
+        geometry, colors = self.geometry.to(self.home), self.network.to(self.home)
+        texture = TextureField(geometry, colors, delta=self.delta, geometry_level=self.level, outside=mean)
+        texture = texture.to(self.home)
+        return FittedTexture(texture.geometry, self.similarity, None, record, texture)
+
+    def made(self, cloud: PointCloud, band_samples: int) -> tuple[ColorSamples, BandSamples]:
+        """The samples of a cloud; ∇f is evaluated once, so that a step evaluates the texture network only."""
+        geometry, generator = self.geometry, self.generator.manual_seed(self.config.seed)
+        about = {"level": self.level, "delta": self.delta}
+        samples = match_colors(cloud, geometry, self.similarity, **about)
+        return samples, band_directions(samples, geometry, band_samples, generator=generator, **about)
+
+    def affordable(self) -> tuple[PointCloud, int]:
+        """As much of the cloud, and as many points of the band, as there is time for."""
+        cloud, band_samples, left = self.cloud, self.config.samples // 2, self.budget.left()
+        if left is None:
+            return cloud, band_samples
+
+        def part(count: int) -> tuple[PointCloud, int]:
+            """So many of the points, and as large a part of the band's."""
+            share = count / max(len(cloud), 1)
+            return _thinned(cloud, share, self.config.seed), max(int(share * band_samples), FEWEST_COLORED)
+
+        seconds = BUDGET.sampling_share * left
+        count = affordable(lambda count: self.made(*part(count)), len(cloud), seconds, fewest=FEWEST_COLORED)
+        if count == len(cloud):
+            return cloud, band_samples
+        some, few = part(count)
+        self.budget.notes.append(f"learns from {len(some):,} points and {few:,} of the band, for want of time")
+        return some, few
+
+    def save(self, field: Field, trainer: Trainer[Any] | None) -> None:
+        """See `Training.save`."""
+        if self.keep is not None and trainer is not None:
+            self.keep(trainer.state())
+
+    def record(self, *, finished: bool) -> dict[str, Any]:
+        """What ``run.json`` holds under ``texture``."""
+        return {
+            "source": self.cloud.source,
+            "level": self.level,
+            "delta": self.delta,
+            "points": len(self.samples.points),
+            "left_out": self.samples.left_out,
+            "parameters": parameter_count(self.network),
+            "steps": self.trainer.step,
+            "sampling_seconds": round(self.sampling_seconds, 3),
+            "training_seconds": round(self.trainer.elapsed, 3),
+            "losses": self.trainer.losses,
+            "psnr_at_points": _psnr(self.network, self.samples, self.generator),
+            **self.common_record(finished=finished),
+        }
 
 
 def texture_run(
@@ -218,9 +341,10 @@ def texture_run(
     with locked(file.parent if beside else target):
         if beside:
             prune(file.parent)
-        before = _interrupted(state_file) if resume else None
-        if before is not None:
-            config, level = before.config, before.level
+        tensors, before = load_state(state_file.parent, name=state_file.name) if resume else ({}, {})
+        if resume:
+            with damage(state_file, "begin again without --resume"):
+                config, level = load_config(TextureConfig, None, before["config"]), before["level"]
         config = config or TextureConfig()
         geometry, similarity, _ = load_field(file)
         if geometry.in_dim == 4:
@@ -228,23 +352,20 @@ def texture_run(
         trained_level = chosen_level(geometry, file, level)
         cloud = read_colors(source, samples=config.samples, seed=config.seed, columns=config.columns)
         fingerprint = _fingerprint(cloud, geometry)
-        if before is not None and before.fingerprint != fingerprint:
+        if before.get("fingerprint", fingerprint) != fingerprint:
             raise InputError(
                 f"{source}: not the colours, or {file} not the field, that the interrupted training began with; "
                 "resume with those, or leave out --resume"
             )
         about = {"config": dataclasses.asdict(config), "level": level, "fingerprint": fingerprint}
-        fitted = fit_texture(
-            geometry,
-            cloud,
-            config,
-            similarity=similarity,
-            level=trained_level,
-            progress=progress,
-            save=lambda tensors: save_state(state_file.parent, tensors, about, name=state_file.name),
-            state=None if before is None else before.tensors,
-            started=started,
-        )
+
+        def keep(state: dict[str, Tensor]) -> None:
+            save_state(state_file, state, about)
+
+        budget = Budget(config.time_budget, started=started)
+        training = _Texturing(geometry, cloud, config, similarity, trained_level, budget, progress or silent, keep)
+        training.trainer_state = tensors
+        fitted = training.run()
         content = texture_bytes(fitted.texture, metadata={"texture": fitted.record})
         finished = bool(fitted.record["finished"])
         if beside:
@@ -264,24 +385,6 @@ def _thinned(cloud: PointCloud, share: float, seed: int) -> PointCloud:
     return dataclasses.replace(cloud, points=cloud.points[kept], normals=normals, colors=colors)
 
 
-class _Before(NamedTuple):
-    """A training that was interrupted: its settings, the level of the geometry, digest of the data, and the rest."""
-
-    config: TextureConfig
-    level: int | None
-    fingerprint: str
-    tensors: dict[str, Tensor]
-
-
-def _interrupted(file: Path) -> _Before:
-    tensors, about = load_state(file.parent, name=file.name)
-    try:
-        config = load_config(TextureConfig, None, about["config"])
-        return _Before(config, about["level"], about["fingerprint"], tensors)
-    except KeyError as error:
-        raise InputError(f"{file}: damaged (no {error}); begin again without --resume") from error
-
-
 def _fingerprint(cloud: PointCloud, geometry: Field) -> str:
     """A digest of points, colours and field."""
     assert cloud.colors is not None
@@ -290,11 +393,7 @@ def _fingerprint(cloud: PointCloud, geometry: Field) -> str:
 
 
 def texture_of(run: str | Path, geometry: Field) -> TextureField | None:
-    """The texture that lies beside the field of a run, or None.
-
-    Args:
-        run: run directory or .safetensors file.
-        geometry: its field, loaded.
+    """The texture that lies beside the field of a run, or None; ``geometry`` is that field.
 
     Raises:
         InputError: there is no such run, or its texture is damaged or belongs to another field.
@@ -311,16 +410,7 @@ def default_delta(geometry: Field) -> float:
 
 
 class TextureObjective(Objective):
-    """The paper's 𝒯(φ): the colours at points, and none of their change along ∇f.
-
-    Args:
-        network: the colours.
-        samples: points with colours.
-        band: points with ∇f.
-        config: settings.
-        delta: half-width of the band.
-        generator: CPU generator that draws the batches.
-    """
+    """The paper's 𝒯(φ): the colours at points, and none of their change along ∇f, of a band of half-width ``delta``."""
 
     def __init__(
         self,

@@ -1,10 +1,8 @@
 """Texture transport: the colours of a surface that moves are those that its points had at the start.
 
-Where it was is integrated back in time along the velocity that was learnt, or else for the vertices of a coarse mesh of
-the moment; what lies between them then moves by the affine map that fits the nearest ones best: displacements are
-smooth, colours need not be. Where surface is made anew, points come from places that are on no surface. Their nearest
-point would jump, so colours are averaged there, the wider the further away (`SpreadColors`). With the colours of the
-end too, both are carried and fade into each other with time.
+Where they were is integrated back in time along the velocity that was learnt, or else for the vertices of a coarse
+mesh; between these, points move by the affine map that fits the nearest ones best. Places that were on no surface have
+averaged colours (`SpreadColors`). Colours of the end, where there are any, fade in with time.
 """
 
 from __future__ import annotations
@@ -27,24 +25,9 @@ from ...neural_fields.spacetime.evolution import VectorField
 from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
 from ...neural_fields.tracing.projection import project_to_surface
-from ..training.folder import find_field
-from ..training.motion import load_motion
+from ..training.folder import find_field, load_motion
 from .spread import CELL, SpreadColors
 from .train import texture_of
-
-__all__ = [
-    "TRANSPORT",
-    "Backward",
-    "Colors",
-    "TransportOptions",
-    "TransportedColors",
-    "TransportedPoints",
-    "borrowed_texture",
-    "colors_of_run",
-    "pinned_texture",
-    "start_texture",
-    "texture_colors",
-]
 
 # Points (N, 3) to display colours (N, 3).
 Colors = Callable[[Tensor], Tensor]
@@ -54,30 +37,19 @@ Backward = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class TransportOptions:
-    """How colours are carried; resolutions are cells along the mesher's box.
+    """How colours are carried; resolutions are cells along the mesher's box."""
 
-    Attributes:
-        step: of Runge and Kutta 4 along the surface's own velocity. Fixed: near a change of topology adaptive steps
-            would shrink to nothing, for the sake of a few points.
-        learned_step: along a velocity that was learnt: smooth, so that in float32 more steps are no nearer.
-        rows: points that are carried along that at once.
-        carried: resolution of the mesh whose vertices are carried.
-        neighbors: of these, which a point between them looks to.
-        ridge: neighbours lie nearly in a plane: across it the affine map is held back by this share of their spread.
-        checked: resolution of the mesh on which a texture is compared with the start.
-        astray: mean distance of its vertices from the texture's surface up to which they are the same, in field units.
-        spread: resolution of the mesh from which colours are spread.
-    """
-
+    # of Runge-Kutta 4 along the surface's own velocity; fixed, or it vanishes near changes of topology
     step: float = 0.05
-    learned_step: float = 1 / 12
-    rows: int = 8192
-    carried: int = 48
-    neighbors: int = 8
-    ridge: float = 1e-3
-    checked: int = 48
+    learned_step: float = 1 / 12  # along a velocity that was learnt, which is smooth
+    rows: int = 8192  # points that are carried along that at once
+    carried: int = 48  # resolution of the mesh whose vertices are carried
+    neighbors: int = 8  # of these, which a point between them looks to
+    ridge: float = 1e-3  # share of the neighbours' spread that regularises the affine map across their plane
+    checked: int = 48  # resolution of the mesh on which a texture is compared with the start
+    # mean distance of its vertices from the texture's surface up to which they are the same, in field units
     astray: float = 0.03
-    spread: int = 128
+    spread: int = 128  # resolution of the mesh from which colours are spread
 
 
 TRANSPORT = TransportOptions()
@@ -88,11 +60,7 @@ def _solver(step: float) -> Solver:
 
 
 def start_texture(run: str | Path, field: Field) -> TextureField | None:
-    """The texture beside a run, of its surface or, if that moves, of its surface at time 0; None without one.
-
-    Args:
-        run: run directory or .safetensors file.
-        field: its field, three- or four-dimensional.
+    """The texture beside a run, of its ``field`` or, if that moves, of its surface at time 0; None without one.
 
     Raises:
         InputError: the texture is damaged or belongs to another field.
@@ -101,15 +69,9 @@ def start_texture(run: str | Path, field: Field) -> TextureField | None:
 
 
 def borrowed_texture(run: str | Path, field: Field, similarity: Similarity) -> tuple[TextureField, Similarity]:
-    """The texture of a run that does not move, for the start of a motion.
+    """The texture of a run that does not move, for the start of a motion, and its way into the motion's coordinates.
 
-    Args:
-        run: run directory or .safetensors file.
-        field: four-dimensional.
-        similarity: the way from its coordinates to input coordinates.
-
-    Returns:
-        The texture, on the field's device, and the similarity that brings its coordinates into the field's.
+    ``similarity`` is the way from the four-dimensional field's coordinates to input coordinates.
 
     Raises:
         InputError: it has no texture, or its surface is not that of the field at time 0.
@@ -125,16 +87,9 @@ def borrowed_texture(run: str | Path, field: Field, similarity: Similarity) -> t
 
 
 def pinned_texture(run: str | Path, field: Field, time: float, own: Callable[[Tensor], Tensor]) -> Colors:
-    """The colours of a run that does not move, for a moment of a motion.
+    """The colours of a run that does not move, of points in its coordinates, for a moment of a motion.
 
-    Args:
-        run: run directory or .safetensors file.
-        field: four-dimensional.
-        time: when its surface is that of the run.
-        own: brings points of it ``(N, 3)`` into the run's coordinates.
-
-    Returns:
-        What its texture says, of points in the run's coordinates.
+    ``own`` brings points ``(N, 3)`` of the motion at that ``time`` into the run's coordinates.
 
     Raises:
         InputError: it has no texture, or its surface is not that of the field then.
@@ -164,12 +119,8 @@ def _texture_at(
 class TransportedPoints:
     """Where points of a surface that moves were at time 0, or will be at another.
 
-    They go along the velocity that the run has learnt, or else along what the normal speeds say (`CarriedVelocity`).
-
-    Args:
-        field: four-dimensional.
-        level: whose surface.
-        motion: the velocity that was learnt.
+    They go along the velocity (``motion``) that the run has learnt, or else along the normal speeds
+    (`CarriedVelocity`).
     """
 
     def __init__(self, field: Field, *, level: int = -1, motion: VectorField | None = None) -> None:
@@ -179,10 +130,8 @@ class TransportedPoints:
     def home(self, time: float, to: float = 0.0) -> Backward:
         """The way from one time to another, for points ``(N, 3)`` of the surface at the first.
 
-        Where surface is made or vanishes on the way they arrive beside the other surface.
-
-        Raises:
-            InputError: the points cannot be followed.
+        Where surface is made or vanishes on the way they arrive beside the other surface. InputError: they cannot be
+        followed.
         """
         if time == to:
             return lambda points: points
@@ -214,15 +163,10 @@ class TransportedPoints:
 
 
 class TransportedColors:
-    """The colours of a surface that moves: those that its points had at time 0.
+    """The colours of a surface that moves: those that its points had at time 0, of a texture or any function of points.
 
-    Args:
-        field: four-dimensional.
-        texture: of its surface at time 0, or any colours of the points of that.
-        placed: from the texture's coordinates to the field's.
-        last: colours of the points of its surface at time 1, for a blend: they weigh t, those of the start 1 − t.
-        level: whose surface.
-        motion: the velocity that was learnt; see `TransportedPoints`.
+    ``placed`` goes from the texture's coordinates to the field's. ``last`` are colours at time 1, for a blend: they
+    weigh t, those of the start 1 − t. ``motion`` is the velocity that was learnt; see `TransportedPoints`.
     """
 
     def __init__(
@@ -242,11 +186,7 @@ class TransportedColors:
             self._ends.append(_Pinned(field, 1.0, last, level))
 
     def at(self, time: float) -> Colors:
-        """The colours of points of the surface at a time.
-
-        Raises:
-            InputError: the points cannot be followed.
-        """
+        """The colours of points of the surface at a time; InputError if the points cannot be followed."""
         shares = [1.0] if len(self._ends) == 1 else [1 - time, time]
         for end in self._ends:
             if time == end.time:
@@ -292,12 +232,7 @@ class _Pinned:
 
 
 def texture_colors(texture: TextureField, placed: Similarity | None = None) -> Colors:
-    """What a texture says at points.
-
-    Args:
-        texture: the texture.
-        placed: from its coordinates to those of the points.
-    """
+    """What a texture says at points; ``placed`` goes from its coordinates to those of the points."""
     placed = placed or Similarity.identity()
 
     @torch.no_grad()
@@ -330,12 +265,7 @@ class _Between:
 
 
 def colors_of_run(run: str | Path, field: Field, time: float | None) -> Colors | None:
-    """The colours of what `load_still` has loaded, or None.
-
-    Args:
-        run: run directory or .safetensors file.
-        field: the field that does not move, or the moment of one that does.
-        time: that moment; None for a field that does not move.
+    """The colours of what `load_still` has loaded, or None; ``time`` is the moment of a field that moves, else None.
 
     Raises:
         InputError: the texture is damaged or belongs to another field.

@@ -1,8 +1,6 @@
 """Run directories: what an argument ``RUN|FILE`` means, and what a training writes and finds again.
 
-All files of a directory belong to one run, whose *generation*, a random name, is in each of them. A checkpoint replaces
-all of them at once (`replace_files`). An old run stays whole until the first checkpoint of a new one. The record has
-the SHA-256 of the field, and each file has one of its tensors.
+All files of a directory belong to one run, whose *generation*, a random name, is in each of them.
 """
 
 from __future__ import annotations
@@ -10,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import secrets
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,48 +18,20 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 from safetensors import safe_open
+from safetensors.numpy import save as save_arrays
 from safetensors.torch import save
 from torch import Tensor
 
 from ...neural_fields import Field, InputError, Similarity, load_field
+from ...neural_fields.backend import files as disk
 from ...neural_fields.backend.files import check_place, damage, json_bytes, write_whole
 from ...neural_fields.checkpoint import SavedField, checksum_of, field_bytes
 from ...neural_fields.spacetime.dynamic_tracing import moment
-from .atomic import is_scratch, prune, recovered, replace_files
-from .config import command_line, load_config
-from .lock import check_unlocked, locked
-
-__all__ = [
-    "CLOUD_FILE",
-    "FIELD_FILE",
-    "MAY_CHANGE",
-    "MERGED_FILE",
-    "RADIANCE_FILE",
-    "RECORD_FILE",
-    "STATE_FILE",
-    "SUPPORT_FILE",
-    "TEXTURE_FILE",
-    "RunFolder",
-    "check_new_run",
-    "chosen_level",
-    "digest_of",
-    "find_field",
-    "fitted_cloud",
-    "is_field",
-    "is_fitted",
-    "kept_cloud",
-    "load_state",
-    "load_still",
-    "named_cloud",
-    "read_record",
-    "resumes_with",
-    "save_state",
-    "state_bytes",
-    "texture_state_file",
-    "write_texture",
-]
+from ...neural_fields.spacetime.velocity import VelocitySiren
+from .settings import command_line, load_config
 
 C = TypeVar("C")
 
@@ -70,18 +41,150 @@ STATE_FILE = "resume.safetensors"
 TEXTURE_FILE = "texture.safetensors"
 RADIANCE_FILE = "radiance.safetensors"
 SUPPORT_FILE = "support.safetensors"
+VELOCITY_FILE = "velocity.safetensors"
 CLOUD_FILE = "cloud.ply"  # what was made of depth maps
 MERGED_FILE = "merged_cloud.npz"  # of a large cloud, made again where it is missing
+JOURNAL = ".journal"
+PARTIAL = re.compile(r"\..*\.(\d+)\.partial(\.[^.]*)?")  # of `whole_file`
 # What a resumed run may do otherwise than it began; all else would make another run of it.
 MAY_CHANGE = ("device", "time_budget")
 # What is in the record alone: too long for the head of a field's file.
 LONG = ("checks", "held_out")
 
 
-def find_field(path: str | Path) -> Path:
-    """The checkpoint that ``RUN|FILE`` names.
+# One writer at a time.
 
-    A change of a run directory that a kill has interrupted is ended now.
+
+def lock_file(target: Path) -> Path:
+    """The lock of a run directory, which lies in it, or of a file, beside it.
+
+    It stays, empty: removing it would let two processes hold locks of two files of one name.
+    """
+    return target / "run.lock" if target.is_dir() else target.with_suffix(".lock")
+
+
+@contextmanager
+def locked(target: Path) -> Iterator[None]:
+    """Be the only writer of a run directory, or of a file, until the block or the process ends.
+
+    Raises:
+        InputError: another process writes there, or the lock cannot be made.
+    """
+    file = lock_file(target)
+    if not file.parent.is_dir():
+        raise InputError(f"{file}: cannot be written (no such folder); choose another place")
+    lock = FileLock(file, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise InputError(
+            f"{target}: is being written by another process; wait until it ends, or choose another -o"
+        ) from error
+    except OSError as error:
+        raise InputError(f"{file}: cannot be written ({error.strerror or error}); choose another place") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def check_unlocked(target: Path) -> None:
+    """Refuse a run directory, or a file, that another process writes; see `locked`."""
+    if lock_file(target).is_file():
+        with locked(target):
+            pass
+
+
+# Several files replaced at once: their new contents are written into one file, the journal, and its renaming is the
+# moment of the change. The files are then written from it. After a kill the next reader or writer repeats that.
+
+
+def replace_files(folder: Path, contents: Mapping[str, bytes], remove: Iterable[str] = ()) -> None:
+    """Write files of a folder, by name, and remove others, which may be absent: after a kill all are old, or all new.
+
+    The caller holds the folder's lock.
+
+    Raises:
+        InputError: the folder cannot be written. It is then unchanged, or the next `recover` ends the change.
+    """
+    packed = {name: np.asarray(bytearray(content)) for name, content in contents.items()}
+    gone = sorted({*remove} - {*contents})
+    disk.write_whole(folder / JOURNAL, save_arrays(packed, {"remove": json.dumps(gone)}))
+    _carry_out(folder, contents, gone)
+
+
+def recover(folder: Path) -> None:
+    """End a change that a kill has interrupted. The caller holds the folder's lock.
+
+    Raises:
+        InputError: the journal is damaged, or the folder cannot be written.
+    """
+    journal = folder / JOURNAL
+    if not journal.is_file():
+        return
+    with damage(journal, "remove it"):
+        with safe_open(journal, framework="np") as file:
+            gone = json.loads(file.metadata()["remove"])
+            contents = {name: file.get_tensor(name).tobytes() for name in file.keys()}  # noqa: SIM118
+        if any(Path(name).name != name for name in [*contents, *gone]):
+            raise ValueError("names a file outside of its folder")
+    _carry_out(folder, contents, gone)
+
+
+def _carry_out(folder: Path, contents: Mapping[str, bytes], gone: Iterable[str]) -> None:
+    """Do what the journal says, and remove it."""
+    try:
+        disk.sync(folder)  # the journal lasts before anything else changes
+        for name, content in contents.items():
+            disk.write_whole(folder / name, content)
+        for name in gone:
+            disk.remove(folder / name)
+        disk.sync(folder)
+        disk.remove(folder / JOURNAL)
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{folder}: cannot be written ({reason}); make room, or choose another -o") from error
+
+
+def recovered(folder: Path) -> None:
+    """Wait up to ten seconds for a change that is under way, and end one that was interrupted; see `recover`."""
+    until = time.monotonic() + 10
+    while (folder / JOURNAL).is_file():
+        try:
+            with locked(folder):
+                recover(folder)
+        except InputError:  # the writer does it
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.05)
+
+
+def prune(folder: Path) -> None:
+    """`recover`, and remove partial files of killed processes. The caller holds the folder's lock."""
+    recover(folder)
+    for file in list(folder.iterdir()):
+        found = PARTIAL.fullmatch(file.name)
+        if found and _has_ended(int(found[1])):
+            disk.remove(file)
+
+
+def _has_ended(number: int) -> bool:
+    """Whether there is no process of this number; False on Windows, which has no signal that only asks."""
+    try:
+        if os.name != "nt":
+            os.kill(number, 0)
+    except ProcessLookupError:
+        return True
+    except (PermissionError, OverflowError):
+        pass
+    return False
+
+
+# What is in a run directory.
+
+
+def find_field(path: str | Path) -> Path:
+    """The checkpoint that ``RUN|FILE`` names; a change of the run directory that was interrupted is ended.
 
     Raises:
         InputError: there is nothing there, it is neither a run directory with a field nor a .safetensors file, or the
@@ -112,12 +215,7 @@ def is_field(path: str | Path) -> bool:
 
 
 def load_still(path: str | Path, time: float | None = None, *, device: torch.device | str = "cpu") -> SavedField:
-    """The field of a run as it is, or that of one moment if it moves.
-
-    Args:
-        path: run directory or .safetensors file.
-        time: the moment, in [0, 1]; None for a field that does not move.
-        device: where to put it.
+    """The field of a run as it is, or, if it moves, that of one moment in [0, 1].
 
     Raises:
         InputError: there is no such run; it moves and no time is given, or the other way round; or the time is not
@@ -149,6 +247,29 @@ def chosen_level(field: Field, file: Path, level: int | None, *, otherwise: int 
     return level
 
 
+def load_motion(run: str | Path) -> VelocitySiren | None:
+    """The velocity that a run of ``evolve --kind deform`` has learnt, on the CPU; None where the run has none.
+
+    Raises:
+        InputError: the file is damaged, or not of this run.
+    """
+    folder = Path(run) if Path(run).is_dir() else Path(run).parent
+    file = folder / VELOCITY_FILE
+    if not file.is_file():
+        return None
+    tensors, about = load_state(folder, name=VELOCITY_FILE)
+    record = read_record(folder)
+    if about.get("generation") != record.get("generation"):
+        raise InputError(f"{file}: not of the run in {folder}; evolve it again")
+    config = record["config"]
+    velocity = VelocitySiren(config["motion_width"], 2, omega=config["motion_omega"])
+    try:
+        velocity.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise InputError(f"{file}: not a motion as {RECORD_FILE} describes it; evolve it again") from error
+    return velocity.requires_grad_(False)
+
+
 def is_fitted(run: Path) -> bool:
     """Whether the training in a directory went to its end."""
     recovered(run)
@@ -158,11 +279,7 @@ def is_fitted(run: Path) -> bool:
 
 
 def kept_cloud(run: Path) -> Path:
-    """The file of the cloud that was made of the depth maps of a run.
-
-    Raises:
-        InputError: the run was not fitted to depth maps.
-    """
+    """The file of the cloud that was made of the depth maps of a run; InputError without one."""
     kept = run / CLOUD_FILE
     if not kept.is_file():
         raise InputError(f"{run}: holds no {CLOUD_FILE}, so it was not fitted to depth maps; name its own cloud")
@@ -170,15 +287,10 @@ def kept_cloud(run: Path) -> Path:
 
 
 def named_cloud(source: str, run: Path | None) -> dict[str, str]:
-    """Where a cloud is, for a record: so that `fitted_cloud` finds it from any folder.
+    """Where the cloud of a run directory is, for a record, so that `fitted_cloud` finds it from any folder.
 
-    Args:
-        source: its file; what else it may be called stays as it is.
-        run: directory of the run, if there is one.
-
-    Returns:
-        ``cloud``, the absolute path, and ``cloud_from_run``, the path from the run's directory, which holds when both
-        are moved together.
+    ``cloud`` is the absolute path; a source that is no file stays as it is. ``cloud_from_run`` is the path from the
+    run's directory, which holds when both are moved together.
     """
     file = Path(source)
     if not file.is_file() and (run is None or file != run / CLOUD_FILE):  # that one comes with the first checkpoint
@@ -191,15 +303,10 @@ def named_cloud(source: str, run: Path | None) -> dict[str, str]:
 
 
 def fitted_cloud(file: Path, metadata: Mapping[str, Any], *, remedy: str) -> Path:
-    """The file of the cloud that a field was fitted to.
-
-    Args:
-        file: the field's checkpoint.
-        metadata: what is in it.
-        remedy: what to do where it is not found, for the message.
+    """The file of the cloud that the field in a ``file`` with this ``metadata`` was fitted to.
 
     Raises:
-        InputError: it is in neither of the places that `named_cloud` noted.
+        InputError: it is in neither of the places that `named_cloud` noted; the message ends with the ``remedy``.
     """
     record = metadata.get("run", {})
     source, from_run = record.get("cloud"), record.get("cloud_from_run")
@@ -238,10 +345,14 @@ def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
             reason = "is finished" if finished else "holds no interrupted run"
             raise InputError(f"{path}: {reason}, so there is nothing to resume; leave out --resume")
         return path
-    if path.is_dir() and not force and not all(is_scratch(file) or file.name == MERGED_FILE for file in path.iterdir()):
+    if path.is_dir() and not force and any(map(_could_be_lost, path.iterdir())):
         hint = " --resume continues it," if (path / STATE_FILE).is_file() else ""
         raise InputError(f"{path}: exists and is not empty;{hint} --force overwrites it, or choose another -o")
     return path
+
+
+def _could_be_lost(file: Path) -> bool:
+    return not (file == lock_file(file.parent) or file.name == MERGED_FILE or PARTIAL.fullmatch(file.name))
 
 
 def resumes_with(run: Path, record: Mapping[str, Any]) -> str | None:
@@ -258,12 +369,11 @@ def resumes_with(run: Path, record: Mapping[str, Any]) -> str | None:
 class RunFolder:
     """What a training writes: its record, a field that is usable at any time, and what it can be resumed from.
 
+    A checkpoint replaces all files at once. An old run stays whole until the first checkpoint of a new one.
+
     Args:
         path: the directory; None keeps nothing.
         resume: whether the interrupted run there is continued.
-
-    Attributes:
-        out: where to write, ``path``; None where nothing is kept, nothing.
 
     Raises:
         InputError: there is no directory to resume from.
@@ -304,19 +414,18 @@ class RunFolder:
         Raises:
             InputError: somebody else writes there, or has written since this was made.
         """
-        if self.out is None:
+        if self.path is None:
             yield
             return
-        self.out.mkdir(parents=True, exist_ok=True)
-        with locked(self.out):
-            prune(self.out)
-            if _generation_in(self.out) != self._found:
+        self.path.mkdir(parents=True, exist_ok=True)
+        with locked(self.path):
+            prune(self.path)
+            if _generation_in(self.path) != self._found:
                 raise InputError(
-                    f"{self.out}: another run was written there meanwhile; look at it, or choose another -o"
+                    f"{self.path}: another run was written there meanwhile; look at it, or choose another -o"
                 )
             if self.resume:
-                record = read_record(self.out)
-                self._generation = record.get("generation", self._generation)
+                self._generation = read_record(self.path).get("generation", self._generation)
             else:
                 self._gone = {SUPPORT_FILE, CLOUD_FILE, *also}
             yield
@@ -328,7 +437,7 @@ class RunFolder:
 
     def keep(self, name: str, content: bytes) -> None:
         """Have a file in the directory from the next checkpoint on."""
-        if self.out is not None:
+        if self.path is not None:
             self._kept[name] = content
 
     def keep_tensors(self, name: str, tensors: Mapping[str, Tensor]) -> None:
@@ -344,19 +453,19 @@ class RunFolder:
         progress: Mapping[str, Any],
     ) -> None:
         """Write a checkpoint: a usable field, and the ``tensors`` and ``progress`` (JSON) that `restore` returns."""
-        if self.out is not None:
+        if self.path is not None:
             about = {**progress, "config": record["config"], "generation": self._generation}
             self.keep(STATE_FILE, state_bytes(tensors, about))
-            self._replace(self.out, field, similarity, record)
+            self._replace(self.path, field, similarity, record)
 
     def finish(
         self, field: Field, similarity: Similarity, record: Mapping[str, Any], *, gone: Iterable[str] = ()
     ) -> dict[str, Any]:
         """Write field and record of a finished run → the record; what was to be resumed, and ``gone``, go."""
-        if self.out is None:
+        if self.path is None:
             return dict(record)
         self._gone |= {STATE_FILE, *gone}
-        return self._replace(self.out, field, similarity, record)
+        return self._replace(self.path, field, similarity, record)
 
     def _replace(self, out: Path, field: Field, similarity: Similarity, record: Mapping[str, Any]) -> dict[str, Any]:
         """Replace the files of the directory at once; the texture of an older field is removed."""
@@ -374,12 +483,9 @@ class RunFolder:
     def restore(self, fingerprint: str, mismatch: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The tensors and the progress that `save` was given last.
 
-        Args:
-            fingerprint: of what the run learns from; it is in the progress.
-            mismatch: what to say if the run began with another.
-
         Raises:
-            InputError: there is nothing to resume, it is damaged, or the fingerprint is another.
+            InputError: there is nothing to resume, it is damaged, or the progress has another ``fingerprint`` of what
+                the run learns from; the message begins with ``mismatch``.
         """
         assert self.path is not None
         tensors, progress = load_state(self.path)
@@ -389,13 +495,9 @@ class RunFolder:
 
 
 def write_texture(run: Path, content: bytes, record: Mapping[str, Any], *, finished: bool) -> None:
-    """Write a texture, and what the record of its run says of it, at once; to be called by who has the run's lock.
+    """Write a texture, and what the record of its run, if there is one, holds as ``texture``, at once.
 
-    Args:
-        run: the directory; without a record, only the texture is written.
-        content: of the file.
-        record: kept as ``texture``.
-        finished: whether its training may be forgotten.
+    The caller holds the run's lock. The state of a ``finished`` training is removed.
 
     Raises:
         InputError: the directory cannot be written, or its record is damaged.
@@ -428,11 +530,7 @@ def _generation_in(run: Path) -> object:
 
 
 def _check_whole(run: Path) -> None:
-    """Refuse a run whose field is not that of its record; a writer who is at it is waited for.
-
-    Raises:
-        InputError: they do not belong together.
-    """
+    """Refuse a run whose field is not that of its record, by SHA-256; a writer who is at it is waited for."""
     for _ in range(20):
         recovered(run)
         try:
@@ -462,11 +560,7 @@ def digest_of(arrays: Iterable[NDArray[Any]]) -> str:
 
 
 def read_record(directory: Path) -> dict[str, Any]:
-    """Read ``run.json``.
-
-    Raises:
-        InputError: there is none, or it is damaged.
-    """
+    """What is in ``run.json``; InputError if there is none, or it is damaged."""
     path = directory / RECORD_FILE
     with damage(path, "fit again into a new directory"):
         try:
@@ -485,25 +579,18 @@ def state_bytes(tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> b
     return save(plain, metadata={"progress": json.dumps(about)})
 
 
-def save_state(
-    directory: Path, tensors: Mapping[str, Tensor], progress: Mapping[str, Any], *, name: str = STATE_FILE
-) -> None:
-    """Write the resume file, whole or not at all; ``progress`` is JSON."""
-    write_whole(directory / name, state_bytes(tensors, progress))
+def save_state(file: Path, tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> None:
+    """Write a file that `load_state` reads, whole or not at all; ``progress`` is JSON."""
+    write_whole(file, state_bytes(tensors, progress))
 
 
 def load_state(
     directory: Path, *, name: str = STATE_FILE, tensors: bool = True
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `save_state` wrote.
-
-    Args:
-        directory: holds it.
-        name: of the file.
-        tensors: whether to read them, too; there are none else.
+    """The tensors, unless they are not wanted, and the progress in a file of `state_bytes`.
 
     Raises:
-        InputError: there is no resume file, or it is damaged.
+        InputError: there is no such file, or it is damaged.
     """
     path = directory / name
     if not path.is_file():

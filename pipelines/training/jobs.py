@@ -1,8 +1,4 @@
-"""Many independent pieces of work: one after the other, in streams of one GPU, or side by side in the workers of Ray.
-
-Ray (https://ray.io) is the extra ``ray``. It starts on this machine alone, joins no cluster, serves no dashboard and
-reports to nobody.
-"""
+"""Many independent pieces of work: one after the other, in streams of one GPU, or in local workers of Ray."""
 
 from __future__ import annotations
 
@@ -21,8 +17,6 @@ import torch
 from ...neural_fields import InputError
 from .trainer import Interrupted, shared_flag, stop_on_signals
 
-__all__ = ["Outcome", "check_jobs", "run_jobs", "run_streams"]
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -37,27 +31,16 @@ RAY_ENVIRONMENT = {
 
 @dataclass(frozen=True)
 class Outcome(Generic[Item, Result]):
-    """What became of one item.
-
-    Attributes:
-        item: what was asked for.
-        value: what the function returned; None if it failed.
-        error: why it failed, in one line; None if it did not.
-        seconds: how long it took.
-    """
+    """What became of one item."""
 
     item: Item
-    value: Result | None
-    error: str | None
+    value: Result | None  # what the function returned; None if it failed
+    error: str | None  # why it failed, in one line; None if it did not
     seconds: float
 
 
 def check_jobs(jobs: int) -> None:
-    """Refuse more than one job where there is no Ray, before any work.
-
-    Raises:
-        InputError: ``jobs`` is not positive, or Ray is needed and not installed.
-    """
+    """Refuse less than one job, and more than one where there is no Ray, by an `InputError` before any work."""
     if jobs < 1:
         raise InputError(f"--jobs {jobs}: expected a whole number from 1")
     if jobs > 1 and importlib.util.find_spec("ray") is None:
@@ -71,17 +54,11 @@ def run_jobs(
     jobs: int = 1,
     report: Callable[[Outcome[Item, Result]], None] | None = None,
 ) -> list[Outcome[Item, Result]]:
-    """Call ``function`` on every item; an item that raises does not stop the others.
+    """Call ``function`` on every item → one outcome per item, in their order; one that raises does not stop the others.
 
-    Args:
-        function: what to do. With several jobs it runs in other processes: what it takes, holds and returns is
-            pickled, and torch there has its share of the cores, ``cores // jobs``.
-        items: what to do it on.
-        jobs: how many at a time. One needs no Ray, and runs in this process.
-        report: told every outcome, as it comes.
-
-    Returns:
-        One outcome per item, in their order.
+    With several ``jobs`` at a time it runs in other processes: what it takes, holds and returns is pickled, and torch
+    there has its share of the cores, ``cores // jobs``. One job needs no Ray, and runs in this process. ``report`` is
+    told every outcome, as it comes.
 
     Raises:
         InputError: see `check_jobs`.
@@ -107,23 +84,13 @@ def run_streams(
     device: torch.device,
     report: Callable[[Outcome[Item, Result]], None] | None = None,
 ) -> list[Outcome[Item, Result]]:
-    """Call ``function`` on every item in threads of this process, each with a CUDA stream of its own.
+    """`run_jobs` in threads of this process, so many at a time, each with a CUDA stream of its own (on a CPU: threads).
 
-    A training of small networks keeps a small part of a GPU busy. What several of them ask for in different streams is
-    done at the same time, and what comes of it is the same.
-
-    Args:
-        function: what to do; all threads call it.
-        items: what to do it on.
-        streams: how many at a time.
-        device: where it is done. A CPU has no streams, but threads.
-        report: told every outcome, as it comes.
-
-    Returns:
-        One outcome per item, in their order.
+    A training of small networks keeps a small part of a GPU busy; several streams are worked on at the same time, with
+    the same results.
 
     Raises:
-        Interrupted: Ctrl-C; trainings under way have heard of it by `stop_on_signals`, nothing else is begun.
+        Interrupted: Ctrl-C. Trainings under way see it by `stop_on_signals`, nothing else is begun.
     """
     outcomes: dict[int, Outcome[Item, Result]] = {}
 

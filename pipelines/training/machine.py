@@ -17,8 +17,6 @@ import torch
 
 from ...neural_fields import InputError
 
-__all__ = ["best_seconds", "environment", "format_table", "peak_memory", "sgemm_rate"]
-
 # Linux keeps the high-water mark of a process here. Not getrusage: its maximum survives exec, so that a child would
 # report what its parent held when it was born.
 STATUS = Path("/proc/self/status")
@@ -27,10 +25,9 @@ _version = functools.cache(importlib.metadata.version)  # it reads files, and ev
 
 
 def best_seconds(work: Callable[[], object], *, repeats: int = 5, median: bool = False) -> float:
-    """Least wall-clock seconds of ``repeats`` calls after one warm-up call.
+    """Least wall-clock seconds of ``repeats`` calls after a warm-up: other processes can only make a run slower.
 
-    The minimum, because other processes can only ever make a run slower; the ``median`` where it is their effect that
-    is to be seen.
+    The ``median`` is for where it is their effect that is to be seen.
     """
     work()
     times = []
@@ -82,14 +79,10 @@ def peak_memory() -> int | None:
 
 
 def choose_device(name: str, *, option: str = "--device") -> torch.device:
-    """``auto`` is CUDA where there is a working GPU, the CPU elsewhere.
-
-    Args:
-        name: of a device.
-        option: where it was said.
+    """The device of this name; ``auto`` is CUDA where there is a working GPU, the CPU elsewhere.
 
     Raises:
-        InputError: no such device here.
+        InputError: no such device here; the message names the ``option``.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -4,26 +4,50 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, ProgressColumn, Task, TaskID, TaskProgressColumn, TextColumn
 from rich.progress import Progress as Bars
 from rich.text import Text
 
-from .report import Progress, Report
+from .settings import input_error
 
-__all__ = ["Lines", "counter_bar", "progress_bars", "time_words"]
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a stage of the work is."""
+
+    stage: str
+    step: int
+    steps: int  # planned; 0 for a stage that does not count steps
+    fraction: float  # of the stage, in [0, 1]; not step / steps where a time budget may end it earlier
+    losses: Mapping[str, float]  # unweighted terms of the last reported step
+
+
+Report = Callable[[Progress], None]
+
+
+def silent(_: Progress, /) -> None:
+    """A `Report` that ignores everything."""
+
+
+@contextmanager
+def reported(report: Report | None, stage: str) -> Iterator[None]:
+    """Report the beginning and the end of a stage that does not count steps."""
+    report = report or silent
+    report(Progress(stage, 0, 0, 0.0, {}))
+    yield
+    report(Progress(stage, 0, 0, 1.0, {}))
 
 
 @contextmanager
 def progress_bars(*, clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
-    """Show a bar for each stage on stderr; where that is no terminal, print lines, see `Lines`.
-
-    Args:
-        clock: seconds, from any origin.
-    """
+    """Show a bar for each stage on stderr; where that is no terminal, print lines, see `Lines`."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield Lines(clock=clock)
@@ -53,9 +77,7 @@ def time_words(seconds: float) -> str:
 class Lines:
     """A line on stderr for each finished stage, and one in between when there was none for half a minute.
 
-    Args:
-        counting: whether stages count something, and are not worth a line when they are done.
-        clock: seconds, from any origin.
+    Stages that are ``counting`` something are not worth a line when they are done.
     """
 
     def __init__(self, *, counting: bool = False, clock: Callable[[], float] = time.monotonic) -> None:
@@ -82,12 +104,9 @@ class Lines:
 
 
 def seconds_left(elapsed: float, before: float, fraction: float) -> float | None:
-    """Seconds that a stage still takes, at the pace so far; None before there is any.
+    """Seconds that a stage still takes at the pace so far; None before there is any.
 
-    Args:
-        elapsed: seconds since it began.
-        before: fraction that was done by then; more than 0 for a resumed one.
-        fraction: that is done now.
+    ``before`` is the fraction that was done when it began ``elapsed`` seconds ago, more than 0 for a resumed one.
     """
     return elapsed * (1 - fraction) / (fraction - before) if fraction > before else None
 
@@ -160,3 +179,38 @@ def _advance(bars: Bars, task: TaskID, fraction: float) -> None:
     left = seconds_left(shown.elapsed or 0.0, shown.fields.get("before", 0.0), fraction)
     shown.total = 1.0 if fraction else None  # `update` cannot take a total away
     bars.update(task, completed=fraction, left=left, at=bars.get_time())
+
+
+@contextmanager
+def tensorboard_log(directory: str | Path) -> Iterator[Report]:
+    """A receiver of progress that writes each loss term of a stage to a ``directory``, as "level 0/surface.data".
+
+    Raises:
+        InputError: tensorboard is not installed, or the directory cannot be made.
+    """
+    writer = _writer(Path(directory))
+    try:
+        yield _Log(writer)
+    finally:
+        writer.close()
+
+
+class _Log:
+    def __init__(self, writer: Any) -> None:
+        self.writer = writer
+
+    def __call__(self, progress: Progress, /) -> None:
+        for name, value in progress.losses.items():
+            self.writer.add_scalar(f"{progress.stage}/{name}", value, progress.step)
+
+
+def _writer(directory: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise input_error("--tensorboard: needs tensorboard; pip install mplicits[tensorboard]") from error
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        return SummaryWriter(str(directory))
+    except OSError as error:
+        raise input_error(f"--tensorboard {directory}: cannot be written ({error.strerror or error})") from error

@@ -1,8 +1,7 @@
-"""Steps of a training as CUDA graphs: all their operations in one launch, with nothing for the host to do in between.
+"""Steps of a training as CUDA graphs: the host takes longer to ask for a thousand small operations than a GPU to do.
 
-A training step of small networks is a thousand operations of microseconds, and the host takes longer to ask for them
-than a GPU to do them. Steps of one kind ask for the same ones: the first is done as usual, in fixed shapes, the second
-is recorded, and from then on it is replayed. What the host knows, random numbers, rates, comes through a `Supply`.
+The first step of a kind is done as usual, in fixed shapes, the second is recorded, and others are replayed. What the
+host knows, random numbers and rates, comes through a `Supply`.
 """
 
 from __future__ import annotations
@@ -17,8 +16,6 @@ import torch
 from torch import Tensor
 
 from ...neural_fields.backend.devices import Supply
-
-__all__ = ["Again", "CudaGraphs", "Recorder", "Replays", "Results", "Work"]
 
 Results = Mapping[str, Tensor]
 Work = Callable[[], Results]
@@ -68,32 +65,17 @@ class Again(Recorder):
 
 @dataclass
 class _Kind:
-    """A kind of step.
+    """A kind of step."""
 
-    Attributes:
-        supply: of what the host hands over.
-        replay: does it again; None until it is recorded.
-        results: of the last time.
-    """
-
-    supply: Supply
-    replay: Callable[[], None] | None
-    results: Results
+    supply: Supply  # of what the host hands over
+    replay: Callable[[], None] | None  # does it again; None until it is recorded
+    results: Results  # of the last time
 
 
 class Replays:
-    """Works by their kinds: done once, recorded, and then replayed.
+    """Works by their kinds: done once, recorded by a ``recorder``, and then replayed. So many kinds are ``kept``.
 
-    Where recording fails, as it may with another version of PyTorch or no memory left, works are done as they are.
-
-    Args:
-        device: where they are done.
-        recorder: how they are recorded.
-        kept: kinds that are kept; each holds memory for all its intermediate results.
-
-    Attributes:
-        recorded: how many times something was.
-        refused: why nothing is recorded any more; empty as long as it is.
+    Where recording fails (another version of PyTorch, no memory left) works are done as they are, and `refused` is why.
     """
 
     def __init__(self, device: torch.device, recorder: Recorder, *, kept: int = 12) -> None:
@@ -102,12 +84,10 @@ class Replays:
         self._kinds: OrderedDict[Hashable, _Kind] = OrderedDict()
 
     def do(self, kind: Hashable, work: Work) -> Results:
-        """Do a work, as it is or by replay.
+        """Do a work, as it is or by replay; the results are overwritten when a work of the same kind is done again.
 
-        Args:
-            kind: works of the same kind ask for the same operations, on the same memory but for what they make.
-            work: made of operations of the device alone; what it needs of the host is `handed` to it. The results are
-                overwritten when a work of the kind is done again.
+        Works of one ``kind`` do the same operations of the device, on the same memory but for what they make; what they
+        need of the host is `handed` to them.
         """
         if self.refused:
             return work()

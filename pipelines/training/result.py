@@ -9,8 +9,6 @@ from typing import Any, Generic, TypeVar
 from ...neural_fields import Field, Mesh, Similarity, WorldField, save_field
 from ...neural_fields.spacetime.dynamic_tracing import moment
 
-__all__ = ["Run"]
-
 F = TypeVar("F", bound=Field, covariant=True)
 
 
@@ -29,11 +27,6 @@ class Run(Generic[F]):
     similarity: Similarity
     directory: Path | None
     record: dict[str, Any]
-
-    @property
-    def folder(self) -> Path | None:
-        """Where it was written, or None."""
-        return self.directory
 
     def shape(self, time: float | None = None) -> WorldField:
         """The field in input coordinates and units: distances, normals, closest points, rays, meshes.

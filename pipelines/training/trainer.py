@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -18,26 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from ...neural_fields.backend.devices import precise
-from .report import Progress, Report, silent
-
-__all__ = [
-    "Group",
-    "Interrupted",
-    "Objective",
-    "Progress",
-    "Report",
-    "StopFlag",
-    "Trainer",
-    "checkpoint_of",
-    "load_compiler",
-    "parameter_count",
-    "restore_frozen",
-    "seeded",
-    "shared_flag",
-    "stop_on_signals",
-    "warm_cosine",
-    "without_prefix",
-]
+from .progress import Progress, Report, silent
 
 Rate = Callable[[float], float]
 
@@ -102,10 +83,7 @@ def shared_flag(flag: StopFlag) -> Iterator[None]:
 
 
 def load_compiler() -> None:
-    """Load PyTorch's compiler, as its first optimiser does; it takes two seconds.
-
-    Loaded before the first stage, they count neither as a step's nor against the share of a level in a time budget.
-    """
+    """Load PyTorch's compiler, as its first optimiser does, before any step is timed: it takes two seconds."""
     torch.optim.Adam([torch.zeros(1, requires_grad=True)])
 
 
@@ -119,43 +97,28 @@ _seeding = threading.RLock()
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """A block whose random numbers follow from ``seed``, and leave no trace in the state of torch's.
-
-    That state belongs to all threads, so that they wait for each other.
-    """
+    """A block whose random numbers follow from ``seed``. Torch's state is put back; threads wait for each other."""
     with _seeding, torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield
 
 
 def warm_cosine(peak: float) -> Rate:
-    """Learning rates for a schedule done to a fraction in [0, 1]: a warm-up to ``peak``, then a cosine to 0.
-
-    Adam's first steps are as long as its later ones, whatever the gradient: warm up over 2 % of the schedule.
-    """
+    """Learning rates by the fraction of a schedule, in [0, 1]: a warm-up to ``peak`` over 2 %, then a cosine to 0."""
     return lambda done: peak * min(1.0, (done + 0.001) / 0.02) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 class Group(NamedTuple):
-    """Parameters that are trained at a rate of their own.
-
-    Attributes:
-        parameters: the tensors.
-        rate: learning rate for a schedule done to a fraction in [0, 1].
-    """
+    """Parameters, and their learning rate for a schedule done to a fraction in [0, 1]."""
 
     parameters: Sequence[nn.Parameter]
     rate: Rate
 
 
 class Objective(ABC):
-    """What a `Trainer` minimises: a network, its loss, and the random numbers that draw the batches.
+    """What a `Trainer` minimises: a ``network``, saved whole, and ``groups`` of its parameters that are trained.
 
-    Attributes:
-        network: saved with the training, whole.
-        groups: those of its parameters that are trained.
-        generator: CPU generator that draws the batches.
-        kept: other tensors that later steps depend on, by name; saved with the training.
+    The CPU ``generator`` draws the batches. ``kept`` are other tensors that later steps depend on, by name; saved too.
     """
 
     def __init__(
@@ -172,9 +135,7 @@ class Objective(ABC):
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """The terms of one fresh batch, unweighted and by name, and their weighted sum.
 
-        Args:
-            step: steps done.
-            done: fraction of the schedule that is done, in [0, 1).
+        ``step`` steps are done, and the fraction ``done`` of the schedule, in [0, 1).
         """
 
 
@@ -188,13 +149,13 @@ class Trainer(Generic[O]):
     Args:
         objective: what is minimised.
         stage: what progress displays call it.
-        steps: how many steps.
+        steps: how many.
         seconds: end the schedule after this long even if steps remain; None for no limit.
         clip: largest norm of the whole gradient; None for any.
         network_name: what the network is called in `state`.
         betas: of Adam.
         eps: of Adam.
-        amsgrad: of Adam: second moments never fall.
+        amsgrad: second moments never fall.
     """
 
     def __init__(
@@ -246,16 +207,10 @@ class Trainer(Generic[O]):
         report_seconds: float = 1.0,
         save_every: float = 20.0,
     ) -> bool:
-        """Train until the schedule ends → True, or until somebody asks to stop → False.
+        """Train until the schedule ends → True, or until the ``flag`` is raised → False.
 
-        Args:
-            flag: see `stop_on_signals`.
-            report: called at the beginning and, with fresh losses, every ``report_every`` steps, every
-                ``report_seconds``, and at the end.
-            save: called every ``save_every`` seconds, and before a stop.
-            report_every: steps between reports; reading the losses makes a GPU wait.
-            report_seconds: no more than about so many seconds between reports.
-            save_every: seconds between checkpoints.
+        ``report`` is called at the beginning and, with fresh losses, every ``report_every`` steps (reading them makes a
+        GPU wait), every ``report_seconds``, and at the end; ``save`` every ``save_every`` seconds, and before a stop.
         """
         flag, report, save = flag or StopFlag(), report or silent, save or (lambda: None)
         start, saved = time.monotonic() - self.elapsed, time.monotonic()
@@ -342,3 +297,52 @@ def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def without_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Those whose names begin with ``prefix``, without it."""
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+class Focus:
+    """Draws pixels of a pool evenly or by the errors of their strips, running means that begin with 1.
+
+    The chance of a pixel, one of the n in a strip with the error e, is ``(1 - share) / N + share · e / (n Σ e)`` of N
+    pixels: what few photographs show is learnt late from even samples. With ``share`` below one no pixel is forgotten,
+    and one that is always wrong has not all. A ``strip`` is so many neighbours of a line; 1 for samples that are no
+    neighbours.
+    """
+
+    def __init__(self, pixels: int, share: float, device: torch.device, *, strip: int = 16) -> None:
+        self.pixels, self.share, self.strip = pixels, share, strip
+        self.errors = torch.ones(-(-pixels // strip), device=device)
+        self.refresh()
+
+    @property
+    def kept(self) -> Mapping[str, Tensor]:
+        """What later steps depend on, for `Objective.kept`."""
+        return {"errors": self.errors, "bounds": self.bounds}
+
+    def watched(self, step: int, kept: MutableMapping[str, Tensor]) -> Focus:
+        """This one at a step of a training, with the objective's ``kept``; refreshed every 16 steps."""
+        self.errors, self.bounds = kept["errors"], kept["bounds"]
+        if step % 16 == 0:
+            self.refresh()
+            kept["bounds"] = self.bounds
+        return self
+
+    def refresh(self) -> None:
+        """Draw by the errors as they are now; a GPU is waited for."""
+        self.bounds = self.errors.double().cumsum(0).cpu()
+
+    def rows(self, count: int, generator: torch.Generator) -> Tensor:
+        """``(count,)`` numbers of pixels on the CPU, with replacement."""
+        if not self.share:
+            return torch.randint(self.pixels, (count,), generator=generator)
+        place, within = torch.rand(2, count, generator=generator, dtype=torch.float64)
+        # The first (1 - share) of the unit interval stands for even draws, and the rest for those by errors.
+        by_error = ((place - (1 - self.share)) / self.share).clamp_min(0) * self.bounds[-1]
+        strips = torch.searchsorted(self.bounds, by_error, right=True).clamp_max(len(self.bounds) - 1)
+        length = (self.pixels - strips * self.strip).clamp_max(self.strip)  # the last one may be shorter
+        rows = strips * self.strip + (within * length).long()
+        return torch.where(place < 1 - self.share, (within * self.pixels).long(), rows)
+
+    def learn(self, rows: Tensor, errors: Tensor) -> None:
+        """Average ``errors`` ``(R,)`` of pixels ``rows`` ``(R,)`` into the errors of their strips."""
+        if self.share:
+            self.errors.scatter_reduce_(0, rows // self.strip, errors, "mean", include_self=True)

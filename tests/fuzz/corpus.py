@@ -35,9 +35,8 @@ from mplicits.datasets import (
 from mplicits.neural_fields import MultiscaleSDF, Siren, load_field, save_field
 from mplicits.neural_fields.backend.files import write_json
 from mplicits.neural_fields.meshing.glb import write_glb
-from mplicits.pipelines.training.config import load_config
-from mplicits.pipelines.training.folder import RECORD_FILE, load_state, read_record, save_state
-from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.folder import RECORD_FILE, STATE_FILE, load_state, read_record, save_state
+from mplicits.pipelines.training.settings import FitConfig, load_config
 from mutate import damaged, damaged_json
 
 Damage = Callable[[bytes, random.Random], bytes]
@@ -197,7 +196,7 @@ def _runs(folder: Path) -> Iterator[Specimen]:
     data = (folder / "field.safetensors").read_bytes()
     yield Specimen("field.safetensors", data, load_field)
     yield Specimen("described.safetensors", data, load_field, damage=_within_safetensors)
-    save_state(folder, {"a": torch.arange(5.0)}, {"fingerprint": "x", "step": 3})
+    save_state(folder / STATE_FILE, {"a": torch.arange(5.0)}, {"fingerprint": "x", "step": 3})
     state = (folder / "resume.safetensors").read_bytes()
     yield Specimen("resume.safetensors", state, _above(load_state, "resume.safetensors"))
     record = {"config": {"seed": 0}, "cloud": "cloud.ply", "finished": True, "levels": [{"loss": 0.1}], "time": 1.5}

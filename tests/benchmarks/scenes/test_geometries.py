@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
-from mplicits.pipelines.reconstruct.model.model import build_scene
+from mplicits.pipelines.reconstruct.model import build_scene
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import parameter_count
 from reconstructions import small_reconstructions

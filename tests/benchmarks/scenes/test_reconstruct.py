@@ -10,9 +10,8 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.neural_fields import InputError, Siren, Sphere, Union, extract_mesh
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.neural_fields.networks.radiance import Outside, ViewColor
-from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel, build_scene
-from mplicits.pipelines.reconstruct.model.objective import SceneObjective
-from mplicits.pipelines.reconstruct.model.replayed import ReplayedTrainer, scene_trainer
+from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
+from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective, scene_trainer
 from mplicits.pipelines.training.replay import Again
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import StopFlag

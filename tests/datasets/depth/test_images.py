@@ -150,16 +150,9 @@ def test_tables_of_points_are_no_depth_maps(tmp_path):
 
 def test_pictures_are_rgb(tmp_path):
     rgb = np.random.default_rng(2).integers(0, 256, (4, 5, 3)).astype(np.uint8)
-    alpha = np.full((4, 5, 1), 9, np.uint8)
-    files = {
-        "rgb.png": rgb[..., ::-1],
-        "rgba.png": np.concatenate((rgb[..., ::-1], alpha), axis=2),
-        "deep.png": rgb[..., ::-1].astype(np.uint16) * 257,
-    }
-    for name, stored in files.items():
-        assert np.array_equal(read_color(write(tmp_path / name, stored)), rgb), name
-    grey = read_color(write(tmp_path / "grey.png", rgb[..., 0]))
-    assert np.array_equal(grey, np.repeat(rgb[..., :1], 3, axis=2))
+    for kind, factor in ((np.uint8, 1), (np.uint16, 257)):
+        stored = rgb[..., ::-1].astype(kind) * factor
+        assert np.array_equal(read_color(write(tmp_path / "rgb.png", stored)), rgb)
     with pytest.raises(InputError, match="float32 of shape"):
         read_color(write(tmp_path / "float.tif", np.ones((4, 5), np.float32)))
     with pytest.raises(InputError, match="unknown extension"):

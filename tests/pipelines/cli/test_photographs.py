@@ -16,9 +16,8 @@ from mplicits.datasets.views.poses.find_points import FoundPoints
 from mplicits.datasets.views.writing import write_colmap
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.reconstruct import train
-from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel
-from mplicits.pipelines.reconstruct.model.objective import SceneObjective
-from mplicits.pipelines.reconstruct.model.replayed import ReplayedTrainer
+from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
+from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective
 from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.training.replay import Recorder, Work
 from mplicits.pipelines.training.settings import ReconstructConfig

@@ -154,12 +154,6 @@ def test_a_mesh_of_a_moment_is_where_the_surface_is_then(run, tmp_path, time):
     assert surface.colors is not None
 
 
-def test_a_picture_of_a_moment_is_drawn(run, tmp_path):
-    drawn = render_run(run, tmp_path / "picture.png", RenderOptions(time=0.5, size=(48,), shading="color"))
-    assert "color" in drawn
-    assert (iio.imread(tmp_path / "picture.png") < 250).any()
-
-
 # Films
 
 

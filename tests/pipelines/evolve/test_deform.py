@@ -17,8 +17,8 @@ from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve.deform import carried_samples, learn_motion, match
 from mplicits.pipelines.evolve.shapes import read_shape
 from mplicits.pipelines.evolve.train import evolve
-from mplicits.pipelines.training.budget import Budget
-from mplicits.pipelines.training.motion import VELOCITY_FILE, load_motion
+from mplicits.pipelines.training.folder import VELOCITY_FILE, load_motion
+from mplicits.pipelines.training.scaffold import Budget
 from mplicits.pipelines.training.settings import EvolveConfig
 from mplicits.pipelines.training.trainer import Interrupted, Progress
 

@@ -11,8 +11,14 @@ from evolutions import BRIEF, few_points
 from mplicits.neural_fields import InputError, RigidMotion, flow
 from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve.deform import learn_motion, match
-from mplicits.pipelines.evolve.landmarks import Landmarks, nearness, placed_landmarks, read_landmarks
-from mplicits.pipelines.evolve.shapes import Placement, read_shape
+from mplicits.pipelines.evolve.shapes import (
+    Landmarks,
+    Placement,
+    nearness,
+    placed_landmarks,
+    read_landmarks,
+    read_shape,
+)
 from mplicits.pipelines.evolve.train import evolve
 from mplicits.pipelines.training.settings import EvolveConfig
 

@@ -315,23 +315,12 @@ def test_the_number_of_shapes_is_checked(kind, count: int) -> None:
         ({"shapes": ("a", "b"), "times": (0.0,)}, "times: 1 numbers for 2 shapes"),
         ({"velocity": (1.0, 2.0)}, "velocity: 2 numbers; expected 3, or 3 per shape"),
         ({"axis": (0.0, 0.0, 0.0)}, "axis: (0.0, 0.0, 0.0); expected a vector of non-zero length"),
-        ({"depths": (2,)}, "depths: 1 entries for 2 widths"),
-        ({"widths": ()}, "widths: expected at least one level"),
-        ({"batch": 0}, "batch: 0; expected a whole number > 0"),
-        ({"law_weight": -1.0}, "law_weight: -1.0; expected a finite number ≥ 0"),
-        ({"frames": 1}, "frames: 1"),
-        ({"time_budget": 0.0}, "time_budget: 0.0; expected a finite number > 0, or none"),
     ],
 )
 def test_settings_out_of_range_are_named(settings: dict, message: str) -> None:
     with pytest.raises(ValueError, match="expected") as caught:
         EvolveConfig(**settings)
     assert message in str(caught.value)
-
-
-def test_key_times() -> None:
-    assert EvolveConfig(shapes=("a", "b", "c")).key_times() == (0.0, 0.5, 1.0)
-    assert EvolveConfig(shapes=("a", "b", "c"), times=(0.0, 0.2, 1.0)).key_times() == (0.0, 0.2, 1.0)
 
 
 def test_a_motion_that_cannot_be_followed_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:

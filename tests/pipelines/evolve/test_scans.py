@@ -12,8 +12,8 @@ from mplicits.neural_fields import Similarity, Sphere, save_field
 from mplicits.neural_fields.backend.files import write_json
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve import deform, scans
-from mplicits.pipelines.evolve.landmarks import read_landmarks
 from mplicits.pipelines.evolve.scans import fits_beside, fitted_scans, scans_among
+from mplicits.pipelines.evolve.shapes import read_landmarks
 from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.training.folder import FIELD_FILE, RECORD_FILE, read_record
 from mplicits.pipelines.training.settings import FitConfig

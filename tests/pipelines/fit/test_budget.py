@@ -10,7 +10,7 @@ import pytest
 from mplicits.datasets import PointCloud
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.folder import read_record
-from mplicits.pipelines.training.report import Progress
+from mplicits.pipelines.training.progress import Progress
 from mplicits.pipelines.training.settings import FitConfig
 
 

@@ -11,9 +11,8 @@ from mplicits.datasets import sample_sphere, sample_torus, write_cloud_ply
 from mplicits.neural_fields import load_field
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit.many import fit_many, plan_fits
-from mplicits.pipelines.training.config import load_config
 from mplicits.pipelines.training.folder import STATE_FILE, find_field, read_record
-from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig, load_config
 from mplicits.pipelines.training.trainer import Interrupted, Progress
 
 SMALL = (

@@ -135,9 +135,7 @@ def exported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, field: nn.Module) 
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     transform = np.concatenate([turn, [[1.0], [2.0], [3.0]]], axis=1)
     outputs = SimpleNamespace(
-        dataparser_transform=torch.from_numpy(transform).float(),
-        dataparser_scale=0.5,
-        cameras=cameras([-0.05, 0.05]),
+        dataparser_transform=torch.from_numpy(transform).float(), dataparser_scale=0.5, cameras=cameras([-0.05, 0.05])
     )
     pipeline = SimpleNamespace(
         model=SimpleNamespace(field=field), datamanager=SimpleNamespace(train_dataparser_outputs=outputs)

@@ -10,8 +10,8 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImage, PosedImages
 from mplicits.neural_fields import Jet, Similarity, Sphere
 from mplicits.neural_fields.volume.render import Rendered, Sampling
-from mplicits.pipelines.reconstruct.model.model import Exposures, PoseCorrections, RayPool, SceneModel, build_scene
-from mplicits.pipelines.reconstruct.model.objective import SceneObjective
+from mplicits.pipelines.reconstruct.model import Exposures, PoseCorrections, RayPool, SceneModel, build_scene
+from mplicits.pipelines.reconstruct.objective import SceneObjective
 from mplicits.pipelines.reconstruct.train import reconstruct
 from mplicits.pipelines.reconstruct.views import ViewImage, exposed_as, measure, render_image
 from mplicits.pipelines.training.settings import ReconstructConfig

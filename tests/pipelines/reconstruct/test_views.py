@@ -1,28 +1,37 @@
 """Rendered views against exact pictures, and figures against closed forms."""
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from mplicits.datasets import look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, render_view, scene_cameras
 from mplicits.datasets.views.images import PosedImage
-from mplicits.neural_fields import Jet, Similarity
+from mplicits.datasets.views.writing import write_transforms
+from mplicits.neural_fields import Jet, Mesh, Similarity, Sphere, Union, extract_mesh, save_field
 from mplicits.neural_fields.networks.value_grid import ValueGrid
 from mplicits.neural_fields.volume.render import Sampling
-from mplicits.pipelines.reconstruct.model.model import SceneModel
+from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.reconstruct.model import SceneModel
 from mplicits.pipelines.reconstruct.views import (
+    SeenFrom,
     ViewImage,
     comparison_sheet,
+    count_views,
     held_out,
     measure,
     reduced,
     render_image,
+    seen_points,
     spread,
     target_of,
 )
+from mplicits.pipelines.surface.surface import Support, seen_part, thinned
 from torch import Tensor, nn
 
 WHITE = torch.ones(3)
@@ -187,16 +196,6 @@ def test_a_grid_of_values_finds_the_same_picture() -> None:
     assert abs(asked.color - guided.color).max() < 0.02
 
 
-def test_samples_of_little_weight_can_be_left_out() -> None:
-    scene, model = SCENES["painted-sphere"](), exact_model("painted-sphere", inv_std=60.0)
-    (view,) = render_scene(scene, views=1, size=12).views
-    whole, light = (
-        render_image(model, view, Similarity.identity(), Sampling(16, 16), least_weight=least) for least in (0.0, 1e-4)
-    )
-    assert abs(whole.color - light.color).max() < 33 * 1e-4
-    assert np.array_equal(whole.opacity, light.opacity)
-
-
 # --- sheets ------------------------------------------------------------------------------------------
 
 
@@ -216,11 +215,6 @@ def test_a_sheet_shows_photograph_rendering_and_normals() -> None:
     assert np.allclose(small[12:20, 18:], 1)
 
 
-def test_large_pictures_keep_their_size() -> None:
-    color = noise(4, 700)
-    assert comparison_sheet([(picture(color), rendered(color))], WHITE).shape == (8, 2100, 3)
-
-
 def test_a_reduced_view_sees_the_same_in_fewer_pixels() -> None:
     full = render_scene(SCENES["painted-sphere"](), views=1, size=64, samples=1).views[0]
     small = reduced(full, 256)
@@ -232,3 +226,162 @@ def test_a_reduced_view_sees_the_same_in_fewer_pixels() -> None:
     assert np.allclose(small.mask, full.mask.reshape(16, 4, 16, 4).mean(axis=(1, 3)), atol=1e-6)
     assert reduced(full, 4096) is full  # as many pixels as there are
     assert reduced(picture(noise(7, 300)), 100).color.shape == (2, 65, 3)
+
+
+RADIUS, DISTANCE = 0.5, 2.0
+
+
+def photograph(eye: tuple[float, float, float], *, masked: bool = False) -> SeenFrom:
+    """Of the unit sphere; its mask, if it has one, is the left half of the picture."""
+    camera = look_at(eye, (0.0, 0.0, 0.0), fov=40, width=160, height=120)
+    mask = np.zeros((120, 160), np.float32)
+    mask[:, :80] = 1
+    return camera, mask if masked else None
+
+
+def share_seen(views: list[SeenFrom]) -> tuple[float, np.ndarray]:
+    """Of the area of the sphere; and the points."""
+    field = Sphere(radius=RADIUS)
+    points, within = seen_points(field, views)
+    assert points.norm(dim=1).numpy() == pytest.approx(RADIUS, abs=2e-3)
+    mesh = extract_mesh(field, resolution=64)
+    _, missed = seen_part(mesh, Support(points.numpy(), within, seen=True))
+    return 1 - missed, points.numpy()
+
+
+def test_two_cameras_side_by_side_see_a_cap() -> None:
+    """From distance d a sphere is seen where its normal is within acos(r / d) of the eye, (1 − r / d) / 2 of it."""
+    eyes = [(0.02, 0.0, DISTANCE), (-0.02, 0.0, DISTANCE)]
+    share, points = share_seen([photograph(eye) for eye in eyes])
+    cap = (1 - RADIUS / DISTANCE) / 2
+    # The rim: two pixels' width, of 40° / 120 at 1.5 to 2, and as much again by which the points end before it, and the
+    # places in which views are counted; of a circle around a sphere, in units of its area.
+    pixel = 2 * 2 * math.tan(math.radians(20)) / 120 * DISTANCE
+    rim = 2 * math.pi * RADIUS * (pixel + 1 / 32) / (4 * math.pi * RADIUS**2)
+    assert share == pytest.approx(cap, abs=rim)
+    assert (points[:, 2] > RADIUS * RADIUS / DISTANCE - 1 / 32).all()
+
+
+def test_what_one_camera_sees_alone_is_not_seen() -> None:
+    ahead, behind = (0.0, 0.0, DISTANCE), (0.0, 0.0, -DISTANCE)
+    _, points = share_seen([photograph(ahead), photograph((0.05, 0.0, DISTANCE)), photograph(behind)])
+    assert (points[:, 2] > 0).all()
+    _, points = share_seen([photograph(ahead)])  # but a single one is all that there is
+    assert len(points) > 100
+
+
+def test_pictures_of_few_pixels_meet_in_places_as_wide_as_those() -> None:
+    few = [look_at((x, 0.0, DISTANCE), (0.0, 0.0, 0.0), fov=40, width=8, height=8) for x in (0.1, -0.1)]
+    points, within = seen_points(Sphere(radius=RADIUS), [(camera, None) for camera in few])
+    # A pixel at the nearest point and at the rim, twice, of 40° / 8: the diagonal of a place is longer than the shift
+    # between the two pictures, so that most of their pixels share one.
+    nearest, rim = DISTANCE - RADIUS, math.sqrt(DISTANCE**2 - RADIUS**2)
+    pixel = 2 * 2 * math.tan(math.radians(20)) / 8
+    assert pixel * nearest < within < 1.1 * pixel * rim
+    assert len(points) > 8
+
+
+def test_masks_say_what_of_it_is_the_object() -> None:
+    eyes = [(0.02, 0.0, DISTANCE), (-0.02, 0.0, DISTANCE)]
+    _, points = share_seen([photograph(eye, masked=True) for eye in eyes])
+    # One half of what is in the picture, but for the cameras' distance: the middle of each sees 0.02 · r / d to a side.
+    assert max((points[:, 0] > -0.02).mean(), (points[:, 0] < 0.02).mean()) == 1
+    assert np.abs(points[:, 0]).max() > 0.4
+
+
+def test_nothing_in_view_is_nothing_seen() -> None:
+    aside = look_at((50.0, 0.0, 0.0), (100.0, 0.0, 0.0), fov=20, width=16, height=12)
+    points, _ = seen_points(Sphere(radius=RADIUS), [(aside, None), (aside, None)])
+    assert len(points) == 0
+
+
+def test_the_part_that_was_seen() -> None:
+    two = Union(Sphere(radius=0.2, center=(0.5, 0.0, 0.0)), Sphere(radius=0.2, center=(-0.5, 0.0, 0.0)))
+    mesh = extract_mesh(two, resolution=64)
+    right = mesh.vertices[mesh.vertices[:, 0] > 0].astype(np.float64)
+    kept = thinned(right, seen_within=0.01)
+    support = Support(kept["points"].double().numpy(), float(kept["seen_within"]), seen=True)
+    part, missed = seen_part(mesh, support)
+    assert part is not None
+    assert missed == pytest.approx(0.5, abs=1e-3)
+    assert (part.vertices[:, 0] > 0).all()
+    assert len(part.faces) == len(mesh.faces) // 2
+    assert seen_part(mesh, support._replace(points=np.array([[0.0, 0.0, 0.9]])))[0] is None
+
+
+def test_other_runs_do_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_field(tmp_path / "field.safetensors", Sphere(radius=RADIUS))
+    assert main(["mesh", str(tmp_path), "-o", str(tmp_path / "a.ply"), "--seen"]) == 2
+    assert "--seen: " in capsys.readouterr().err
+
+
+BALLS = (np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.5]))
+RADII = (0.5, 0.3)
+
+
+def balls() -> Mesh:
+    parts = [trimesh.creation.icosphere(4, radius=r) for r in RADII]
+    for part, center in zip(parts, BALLS, strict=True):
+        part.apply_translation(center)
+    both = trimesh.util.concatenate(parts)
+    return Mesh(np.asarray(both.vertices), np.asarray(both.faces))
+
+
+def hidden_by(eye: np.ndarray, points: np.ndarray, margin: float) -> np.ndarray:
+    """Whether the way from an eye to points meets a ball of a radius that is larger by ``margin``."""
+    found = np.zeros(len(points), dtype=bool)
+    for center, radius in zip(BALLS, RADII, strict=True):
+        way = points - eye
+        length = np.linalg.norm(way, axis=1)
+        along = ((center - eye) * way).sum(axis=1) / length
+        off = np.linalg.norm(eye + along[:, None] * way / length[:, None] - center, axis=1)
+        on_it = np.abs(np.linalg.norm(points - center, axis=1) - radius) < 1e-2
+        # The far side of its own ball: the way enters it before it gets there.
+        # A larger margin hides more.
+        found |= np.where(on_it, along - margin < length, (off < radius + margin) & (along < length))
+    return found
+
+
+@pytest.mark.parametrize("size", [64, 512])  # both are looked at in 512 pixels
+def test_counts_are_those_of_the_closed_form(size: int) -> None:
+    eyes = [(0.0, 0.0, 4.0), (4.0, 0.5, 0.0), (0.3, 3.0, -2.0)]
+    cameras = [
+        look_at(torch.tensor(eye, dtype=torch.float64), (0, 0, 0.6), up=(0, 1, 0), fov=40, width=size, height=size)
+        for eye in eyes
+    ]
+    surface = balls()
+    middle = surface.vertices[surface.faces].mean(axis=1)
+    asked: list[tuple[int, int]] = []
+    counts = count_views(cameras, surface, middle, finest=512, progress=lambda *done: asked.append(done))
+    assert asked == [(1, 3), (2, 3), (3, 3)]
+    sure = np.ones(len(middle), dtype=bool)
+    exact = np.zeros(len(middle), dtype=int)
+    for camera, eye in zip(cameras, eyes, strict=True):
+        # A pixel is 0.006 at that distance, and near a rim a place counts that is up to ten beyond it.
+        least, most = (~hidden_by(np.array(eye), middle, margin) for margin in (0.06, -0.06))
+        framed = camera.in_view(middle)[2]
+        sure &= least == most
+        exact += least & framed
+    assert sure.mean() > 0.4
+    assert np.array_equal(counts[sure], exact[sure])
+    assert set(np.unique(exact)) >= {0, 1, 2}
+
+
+@pytest.mark.slow
+def test_the_command_says_how_near_the_mesh_is_where_photographs_see(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_transforms(tmp_path / "photos", render_scene(SCENES["painted-sphere"](), views=2, size=8, samples=1))
+    truth, cloud, figures = (tmp_path / name for name in ("ball.ply", "cloud.xyz", "figures.json"))
+    trimesh.creation.icosphere(2, radius=0.6).export(truth)
+    some = ["--photos", str(tmp_path / "photos"), "--samples", "2000", "--json", str(figures)]
+    assert main(["evaluate", str(truth), str(truth), *some]) == 0
+    assert "chamfer where 2 photographs see" in capsys.readouterr().out
+    parts = json.loads(figures.read_text())["seen"]["parts"]
+    assert sum(part["share"] for part in parts) == pytest.approx(1)
+    # A camera at four radii sees (1 - 1/4) / 2 of a ball, and so do both; some 40 samples of 2000 are beside a rim.
+    assert parts[1]["share"] + 2 * parts[2]["share"] == pytest.approx(2 * 0.375, abs=0.05)
+    assert parts[3]["share"] == parts[4]["share"] == 0
+    np.savetxt(cloud, np.random.default_rng(0).normal(size=(50, 3)))
+    assert main(["evaluate", str(truth), str(cloud), *some]) == 2
+    assert f"{cloud}: points hide nothing" in capsys.readouterr().err

@@ -142,13 +142,6 @@ def test_a_journal_reaches_nothing_outside(tmp_path: Path, name: str) -> None:
     assert (tmp_path / "mine").read_bytes() == b""
 
 
-def test_what_an_older_version_left_half_written_is_said(tmp_path: Path) -> None:
-    write_run(tmp_path, 0)
-    (tmp_path / ".ready").mkdir()
-    with pytest.raises(InputError, match="an older version was killed while it wrote; move the files of"):
-        find_field(tmp_path)
-
-
 # Trainings, whose steps are all checkpoints
 
 

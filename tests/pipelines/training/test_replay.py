@@ -41,11 +41,6 @@ def test_what_is_handed_over_is_made_anew_in_the_same_order(device: torch.device
         assert torch.equal(rows, torch.randint(100, (4,), generator=random))
 
 
-def test_outside_of_a_supply_what_is_handed_over_is_just_made(device: torch.device) -> None:
-    assert handed(lambda: torch.arange(3), device).tolist() == [0, 1, 2]
-    assert not is_supplied()
-
-
 def test_replays_are_the_work_itself(accelerator: torch.device) -> None:
     replays, told = Replays(accelerator, recorder(accelerator)), [0.0]
     total = torch.zeros(2, device=accelerator)

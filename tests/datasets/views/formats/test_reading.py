@@ -71,10 +71,6 @@ def assert_same(read: list[tuple[str, Camera]], names: list[str]) -> None:
 NAMES = [f"images/{k}.png" for k in range(3)]
 
 
-def test_intrinsics_at_the_top_of_the_file(tmp_path):
-    assert_same(read_cameras(write_json(tmp_path, transforms(**FOCAL, **SIZE, k1=0.1, p2=-0.2))), NAMES)
-
-
 def test_intrinsics_in_each_frame_go_before_those_at_the_top(tmp_path):
     content = transforms(fl_x=1.0, fl_y=1.0, cx=1.0, cy=1.0, w=1, h=1)
     for frame in content["frames"]:
@@ -108,10 +104,6 @@ def test_poses_are_made_rigid_from_few_digits_three_rows_or_a_scale(tmp_path):
         frame["transform_matrix"] = matrix.tolist()
     for (_, camera), expected in zip(read_cameras(write_json(tmp_path, content)), cameras(), strict=True):
         torch.testing.assert_close(camera.world_from_camera, expected.world_from_camera, rtol=0, atol=2e-5)
-
-
-def test_neus_projections_are_taken_apart(tmp_path):
-    assert_same(read_cameras(write_neus(tmp_path)), [f"image/{k:03d}.png" for k in range(3)])
 
 
 @pytest.mark.parametrize("factor", [-1.0, 0.01])

@@ -3,22 +3,25 @@
 import dataclasses
 import json
 import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 from mplicits.datasets.cameras import Camera, look_at
-from mplicits.datasets.synthetic.scenes import SCENES, render_scene
+from mplicits.datasets.synthetic.scenes import SCENES, render_scene, scene_cameras, scene_depths
 from mplicits.datasets.synthetic.view_faults import with_fault
-from mplicits.datasets.views.images import PosedImage
+from mplicits.datasets.views.images import PosedImage, PosedImages
 from mplicits.datasets.views.writing import write_colmap, write_neus, write_transforms
 from mplicits.neural_fields import Similarity
-from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.cli import main
 from mplicits.pipelines.cli.views import SCENE_NAMES
-from mplicits.pipelines.reconstruct.checks.check import check_cameras, check_files
-from mplicits.pipelines.reconstruct.checks.frustums import camera_mesh, frustum_size
-from mplicits.pipelines.reconstruct.data.silhouettes import Agreement
+from mplicits.pipelines.reconstruct.check import DepthCheck, check_cameras, check_depths, check_files
+from mplicits.pipelines.reconstruct.frustums import camera_mesh, frustum_size
+from mplicits.pipelines.reconstruct.silhouettes import Agreement
 from mplicits.pipelines.surface.surface import read_surface
 
 WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}
@@ -114,10 +117,28 @@ def test_figures_do_not_depend_on_where_the_world_is(good):
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def test_the_other_convention_looks_away(good):
-    warning = the_warning(turned(good, lambda pose: pose @ FLIP))
-    assert "look away: 8 of 8" in warning
-    assert "OpenGL or OpenCV" in warning
+def darker(images, factor):
+    return with_views(images, lambda k, v: replace(v, color=v.color * np.float32(factor)) if k == 6 else v)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda good: turned(good, lambda pose: pose @ FLIP), "look away: 8 of 8"),
+        (lambda good: replace(good, similarity=Similarity((0, 0, 0), 2.5)), "8 of 8 cameras stand inside"),
+        (
+            lambda good: replace(good, similarity=Similarity((0.0, 0.0, 1.3), 0.5), points=None),
+            "middle of the region of interest is out of view in",
+        ),
+        (lambda good: darker(good, 0.3), "1 of 8 images are two stops or more off the others' brightness: 006.png"),
+        (lambda good: darker(good, 0.8), None),
+    ],
+)
+def test_what_is_wrong_is_said_alone(good, change, words):
+    if words is None:
+        assert check_cameras(change(good)).warnings == ()
+    else:
+        assert words in the_warning(change(good))
 
 
 def test_poses_from_world_to_camera_are_noticed(good):
@@ -135,17 +156,6 @@ def test_one_camera_astray_shows_in_its_mask_alone(good):
     assert the_warning(mixed).startswith("1 of 8 silhouettes contradict the others: 003.png")
     bare = with_views(mixed, lambda _, view: dataclasses.replace(view, mask=None))
     assert check_cameras(bare).warnings == ()
-
-
-def test_cameras_inside_the_region(good):
-    images = dataclasses.replace(good, similarity=Similarity((0, 0, 0), 2.5))
-    assert "8 of 8 cameras stand inside" in the_warning(images)
-
-
-def test_a_region_beside_the_pictures(good):
-    images = dataclasses.replace(good, similarity=Similarity((0.0, 0.0, 1.3), 0.5), points=None)
-    warning = the_warning(images)
-    assert "middle of the region of interest is out of view in" in warning
 
 
 def test_a_region_that_cuts_the_object(good):
@@ -255,14 +265,6 @@ def test_inexact_poses_are_not_taken_for_turned_pictures(figure):
         assert not any("silhouettes" in line for line in check_cameras(inexact).warnings)
 
 
-def test_exposures_two_stops_apart(good):
-    dark = with_views(good, lambda k, v: dataclasses.replace(v, color=v.color * np.float32(0.3)) if k == 6 else v)
-    assert "1 of 8 images" in the_warning(dark)
-    assert "006.png" in the_warning(dark)
-    dim = with_views(good, lambda k, v: dataclasses.replace(v, color=v.color * np.float32(0.8)) if k == 6 else v)
-    assert check_cameras(dim).warnings == ()
-
-
 # --- the mesh ----------------------------------------------------------------------------------------
 
 
@@ -302,14 +304,6 @@ def test_a_picture_hangs_where_its_pixels_are_seen(good):
     assert (facing > 0).sum() == (facing < 0).sum() == 2 * 39 * 19
     nearest = camera.project(torch.from_numpy(triangle[:, 0]))[1].numpy() < float(z.min()) + 1e-9
     assert np.array_equal(nearest, facing < 0)  # the side towards the eye is nearer to it
-
-
-def test_the_roof_is_above_the_picture(good):
-    camera = look_at((0, 0, 4), (0, 0, 0), width=8, height=8)
-    view = PosedImage("a.png", camera, np.full((8, 8, 3), 0.5, np.float32), None)
-    mesh = camera_mesh(dataclasses.replace(good, views=(view,), points=None))
-    far = mesh.vertices[mesh.vertices[:, 2] > 1.1]  # beyond the sphere, the camera alone
-    assert far[:, 1].max() > 1.4 * -far[:, 1].min()
 
 
 def test_lines_are_closed_tubes_and_faces_point_outward(good):
@@ -364,17 +358,6 @@ def test_a_flipped_file_is_shown_around_a_guess(tmp_path, capsys, good):
     assert all(np.linalg.norm(vertices - view.camera.eye.numpy(), axis=1).min() < 0.02 for view in good.views)
 
 
-def test_a_panorama_is_all_at_one_place(tmp_path, good):
-    def at_one_place(pose):
-        pose = pose.copy()
-        pose[:3, 3] = 1, 2, 3
-        return pose
-
-    write_transforms(tmp_path / "data", turned(good, at_one_place))
-    _, check, _ = check_files(tmp_path / "data")
-    assert "stand at one place" in check.warnings[0]
-
-
 def test_mistakes_end_in_one_line(tmp_path, capsys, good):
     write_neus(tmp_path / "data", good)
     picture = tmp_path / "data" / "image" / "003.png"
@@ -410,3 +393,111 @@ def test_scenes_come_with_their_truth(tmp_path, capsys, form):
 
 def test_the_command_knows_every_scene():
     assert set(SCENE_NAMES) == set(SCENES)
+
+
+VIEWS = 10
+Numbers = np.ndarray
+
+
+@pytest.fixture(scope="module")
+def scene() -> PosedImages:
+    """The depths of the figure, and photographs in which it is black."""
+    figure, views = SCENES["figure"](), []
+    for index, camera in enumerate(scene_cameras(figure, views=VIEWS, size=48)):
+        depth = scene_depths(figure, camera)
+        mask = np.isfinite(depth.numbers).astype(np.float32)
+        views.append(PosedImage(f"{index:03d}.png", camera, np.zeros((48, 48, 3), np.float32), mask, depth))
+    return PosedImages(tuple(views), Similarity.identity(), "the unit sphere", None, Path("figure"))
+
+
+def changed(images: PosedImages, change: Callable[[int, list[Numbers]], Numbers]) -> PosedImages:
+    """The same views; the map of each is what ``change`` says of its number and all maps."""
+    maps = [view.depth.numbers for view in images.views if view.depth is not None]
+    views = [
+        replace(view, depth=replace(view.depth, numbers=change(index, maps)))
+        for index, view in enumerate(images.views)
+        if view.depth is not None
+    ]
+    return replace(images, views=tuple(views))
+
+
+def checked(images: PosedImages) -> DepthCheck:
+    check = check_depths(images)
+    assert check is not None
+    return check
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_exact_maps_agree(scene: PosedImages, masks: bool) -> None:
+    images = scene if masks else replace(scene, views=tuple(replace(view, mask=None) for view in scene.views))
+    check = checked(images)
+    assert (check.maps, check.inside, check.warnings) == (VIEWS, 1.0, ())
+    assert check.seen_through == 0  # what lies around a pixel is nearer than its reading, or as near, but for slopes
+
+
+def test_a_sensor_s_noise_is_no_contradiction(scene: PosedImages) -> None:
+    random = np.random.default_rng(0)
+    noisy = changed(scene, lambda index, maps: maps[index] * (1 + 0.01 * random.standard_normal(maps[index].shape)))
+    assert not checked(noisy).warnings
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (0.8, "contradict each other"),
+        (1.25, "contradict each other"),
+        (1000.0, "0.0% of the depths in all maps"),
+    ],
+)
+def test_other_units_are_noticed(scene: PosedImages, factor: float, words: str) -> None:
+    (warning,) = checked(changed(scene, lambda index, maps: factor * maps[index])).warnings
+    assert words in warning
+    assert "--depth-scale" in warning
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda index, maps: maps[index][:, ::-1].copy(), lambda index, maps: maps[index - 1]],
+    ids=["mirrored", "next"],
+)
+def test_maps_of_something_else_contradict_each_other(
+    scene: PosedImages, change: Callable[[int, list[Numbers]], Numbers]
+) -> None:
+    (warning,) = checked(changed(scene, change)).warnings
+    assert "are they of these photographs" in warning
+
+
+def test_maps_of_unknown_scale_are_counted(scene: PosedImages) -> None:
+    loose = [replace(view, depth=replace(view.depth, kind="disparity")) for view in scene.views if view.depth]
+    assert checked(replace(scene, views=tuple(loose))) == DepthCheck(VIEWS)
+    assert check_depths(replace(scene, views=tuple(replace(view, depth=None) for view in scene.views))) is None
+
+
+def test_one_map_cannot_be_held_against_others(scene: PosedImages) -> None:
+    check = checked(replace(scene, views=scene.views[:1]))
+    assert check.seen_through is None
+    empty = changed(scene, lambda index, maps: np.full_like(maps[index], np.nan))
+    assert checked(empty).warnings == ("no depth map has a reading",)
+
+
+def test_the_command_says_so(tmp_path: Path, scene: PosedImages, capsys: pytest.CaptureFixture[str]) -> None:
+    write_transforms(tmp_path / "photos", scene)
+    assert main(["check-cameras", str(tmp_path / "photos")]) == 0
+    said = capsys.readouterr()
+    line = f"depth maps: {VIEWS} of {VIEWS} photographs have one; 100.0% of the readings end in the region; other views"
+    assert line in said.out
+    assert "depth" not in said.err
+    wrong = ["--depth-maps", str(tmp_path / "photos" / "depths"), "--depth-scale", "0.8"]
+    assert main(["check-cameras", str(tmp_path / "photos"), *wrong]) == 0
+    assert "warning: the depth maps contradict each other" in capsys.readouterr().err
+    assert main(["check-cameras", str(tmp_path / "photos"), *wrong, "--depth-kind", "relative"]) == 0
+    said = capsys.readouterr()
+    assert f"depth maps: {VIEWS} of {VIEWS} photographs have one\n" in said.out
+    assert "depth" not in said.err
+
+
+def test_wrong_cameras_are_said_alone(scene: PosedImages) -> None:
+    turned = [replace(view, camera=scene.views[0].camera) for view in scene.views]
+    check = check_cameras(replace(scene, views=tuple(turned)))
+    assert check.depths is not None
+    assert not any("depth" in warning for warning in check.warnings[1:])

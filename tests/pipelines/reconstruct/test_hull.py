@@ -9,18 +9,12 @@ import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import InputError, Siren
-from mplicits.pipelines.reconstruct.data.measured import MeasuredDepths
-from mplicits.pipelines.reconstruct.data.silhouettes import Agreement
-from mplicits.pipelines.reconstruct.initialisation import hull
-from mplicits.pipelines.reconstruct.initialisation.hull import (
-    HULL,
-    begin,
-    carve,
-    fitting_resolution,
-    start_at_hull,
-)
-from mplicits.pipelines.reconstruct.model import model as scene_model
-from mplicits.pipelines.reconstruct.model.model import build_scene
+from mplicits.pipelines.reconstruct import hull
+from mplicits.pipelines.reconstruct import model as scene_model
+from mplicits.pipelines.reconstruct.hull import HULL, begin, carve, fitting_resolution, seen_through, start_at_hull
+from mplicits.pipelines.reconstruct.measured import MeasuredDepths
+from mplicits.pipelines.reconstruct.model import build_scene
+from mplicits.pipelines.reconstruct.silhouettes import Agreement
 from mplicits.pipelines.training.settings import ReconstructConfig
 
 SMALL = ReconstructConfig(
@@ -196,3 +190,38 @@ def test_what_no_measured_ray_passes_is_a_start(monkeypatch: pytest.MonkeyPatch)
     assert by_masks is not None
     assert bool((started[1] >= by_masks - 2 * cell).all())  # carved further
     assert int((started[1] > 0).sum()) > int((by_masks > 0).sum())
+
+
+@pytest.fixture(scope="module")
+def unmasked() -> PosedImages:
+    """A sphere with depth maps and sparse points, and without masks."""
+    scene = render_scene(SCENES["painted-sphere"](), views=8, size=24, samples=1, depths=True)
+    return replace(scene, views=tuple(replace(view, mask=None) for view in scene.views))
+
+
+def measured_of(unmasked: PosedImages, *, maps: bool = True) -> MeasuredDepths:
+    some = unmasked if maps else replace(unmasked, views=tuple(replace(view, depth=None) for view in unmasked.views))
+    return MeasuredDepths(some.views, some, torch.device("cpu"))
+
+
+@pytest.mark.parametrize("kind", ["maps", "points"])
+def test_rays_carve_what_is_outside_and_nothing_inside(unmasked: PosedImages, kind: str) -> None:
+    resolution = 24
+    empty = seen_through(measured_of(unmasked, maps=kind == "maps"), resolution)
+    axis = torch.linspace(-1, 1, resolution + 1)
+    length = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).norm(dim=0)
+    cell = 2 / resolution
+    # Places of a ray, which is outside, are rounded to the next vertex: half a diagonal away at most.
+    assert not bool(empty[length < RADIUS - 0.5 * 3**0.5 * cell].any())
+    beyond = (length > RADIUS + 3 * cell) & (length < 0.95)
+    assert float(empty[beyond].float().mean()) > (0.5 if kind == "maps" else 0.15)
+
+
+def test_one_wrong_measurement_carves_no_hole(unmasked: PosedImages) -> None:
+    measured = measured_of(unmasked)
+    measured.numbers[0] *= 2  # through the sphere and far behind it
+    right, wrong = seen_through(measured_of(unmasked), 24), seen_through(measured, 24)
+    axis = torch.linspace(-1, 1, 25)
+    inside = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).norm(dim=0) < RADIUS - 0.08
+    assert not bool((wrong & inside).any())
+    assert int((wrong != right).sum()) < 25

@@ -1,8 +1,4 @@
-"""Cameras as things to look at: frustums that carry their pictures, a wire sphere, axes and points, in one mesh.
-
-Everything is made of triangles with colours at their corners, because that is what every viewer shows: lines are tubes,
-points are octahedra. Coordinates are those of the unit sphere.
-"""
+"""Cameras as triangles with colours, in unit-sphere coordinates: frustums with pictures, a sphere, axes, points."""
 
 from __future__ import annotations
 
@@ -15,12 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ....datasets.cameras import Camera
-from ....datasets.views.images import PosedImages
-from ....neural_fields.meshing.extract import Mesh
-from ...render.shade import COLOR_MAPS, apply_color_map
-
-__all__ = ["camera_mesh", "frustum_size"]
+from ...datasets.cameras import Camera
+from ...datasets.views.images import PosedImages
+from ...neural_fields.meshing.extract import Mesh
+from ..render.shade import COLOR_MAPS, apply_color_map
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -52,16 +46,10 @@ class _Part(NamedTuple):
 
 
 def camera_mesh(images: PosedImages) -> Mesh:
-    """Frustums, the unit sphere around the region of interest, the axes of the world and the sparse points.
+    """Frustums, the unit sphere around the region of interest, the axes of the world and sparse points, as one mesh.
 
     The lines of a frustum go from violet (the first view) to yellow (the last); its image plane shows the picture, and
     a triangle stands on the upper edge. The axes at the middle are those of the world: x red, y green, z blue.
-
-    Args:
-        images: what to show.
-
-    Returns:
-        A mesh with colours in unit-sphere coordinates.
     """
     cameras = [view.camera.moved(images.similarity) for view in images.views]
     size, reach = frustum_size(cameras)
@@ -81,11 +69,7 @@ def camera_mesh(images: PosedImages) -> Mesh:
 
 
 def frustum_size(cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Longer side of the image planes and their greatest distance from the eyes, so that neighbours hardly meet.
-
-    Args:
-        cameras: in unit-sphere coordinates.
-    """
+    """Longer side of the image planes and their greatest distance from the eyes, so that neighbours hardly meet."""
     eyes = torch.stack([camera.eye for camera in cameras])
     distance = max(float(eyes.norm(dim=1).median()), 0.1)
     apart = torch.cdist(eyes, eyes).fill_diagonal_(torch.inf).amin(dim=1)

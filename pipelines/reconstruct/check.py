@@ -1,7 +1,4 @@
-"""Whether posed photographs can be right: figures of their cameras, and warnings about what is usually wrong.
-
-All lengths are in radii of the region of interest, because cameras are moved into its unit sphere first.
-"""
+"""Whether posed photographs can be right: figures of cameras, in radii of the region of interest, and warnings."""
 
 from __future__ import annotations
 
@@ -17,18 +14,113 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ....datasets import read_cameras, srgb_to_linear
-from ....datasets.cameras import Camera
-from ....datasets.clouds.cleaning.orientation import fibonacci_directions
-from ....datasets.views.formats.shots import DepthSource
-from ....datasets.views.images import PosedImage, PosedImages, read_posed_images
-from ....neural_fields import InputError, Similarity
-from ...mesh.files import write_mesh
-from ..data.silhouettes import Agreement, named
-from .depth_check import DepthCheck, check_depths
+from ...datasets import read_cameras, srgb_to_linear
+from ...datasets.cameras import Camera
+from ...datasets.clouds.cleaning.orientation import fibonacci_directions
+from ...datasets.views.formats.shots import DepthMap, DepthSource
+from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
+from ...datasets.views.poses.colmap_process import Report as ColmapReport
+from ...datasets.views.poses.find_cameras import FoundCameras
+from ...datasets.views.poses.find_points import FoundPoints
+from ...neural_fields import InputError, Similarity
+from ..mesh.files import write_mesh
+from ..training.progress import Progress, Report, silent
 from .frustums import camera_mesh
+from .measured import UNITS, said_outside
+from .silhouettes import Agreement, named
 
-__all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DepthCheck:
+    """What is known of the depth maps of a data set."""
+
+    maps: int  # how many views have one
+    inside: float | None = None  # share of the readings that end in the region; None where their scale is not known
+    # share, in the median view, in whose place another view sees further; None: no two maps can be compared
+    seen_through: float | None = None
+    warnings: tuple[str, ...] = ()  # one line each
+
+    def in_words(self, views: int) -> str:
+        """One line, for a data set of so many views."""
+        words = [f"depth maps: {self.maps} of {views} photographs have one"]
+        if self.inside is not None:
+            words.append(f"{self.inside:.1%} of the readings end in the region")
+        if self.seen_through is not None:
+            words.append(f"other views see through {self.seen_through:.1%} of them")
+        return "; ".join(words)
+
+    def record(self) -> dict[str, Any]:
+        """As numbers, for JSON."""
+        return {"maps": self.maps, "share_inside": self.inside, "share_seen_through": self.seen_through}
+
+
+def check_depths(images: PosedImages) -> DepthCheck | None:
+    """Compare depth maps with the region and with each other; None if there are none.
+
+    Maps of unknown scale and shift are only counted. A reading counts as seen through if it lies 1 % of its depth (the
+    noise of sensors) and 2 % of the region's radius before what another view sees in its place.
+    """
+    maps = [view.depth for view in images.views if view.depth is not None]
+    views = [view for view in images.views if view.depth is not None and view.depth.kind == "metric"]
+    metric = [view.depth for view in views if view.depth is not None]
+    if not metric:
+        return DepthCheck(len(maps)) if maps else None
+    places = [_places(depth) for depth in metric]
+    if not sum(map(len, places)):
+        return DepthCheck(len(maps), warnings=("no depth map has a reading",))
+    inside = float((np.linalg.norm(images.similarity.to_unit(np.concatenate(places)), axis=1) < 1).mean())
+    smallest = list(map(_smallest, views))
+    margin = 0.02 * images.similarity.scale
+    shares = [_seen_through(index, places[index], metric, smallest, margin) for index in range(len(metric))]
+    known = [share for share in shares if share is not None]
+    usual = float(np.median(known)) if known else None
+    warnings = []
+    if outside := said_outside(inside):
+        warnings.append(outside)
+    elif usual is not None and usual > 0.08:  # exact maps and those of sensors have hardly any
+        warnings.append(
+            f"the depth maps contradict each other: of the median one others see through {usual:.0%} of the readings; "
+            f"are they of these photographs, and along the axis of view? If in other units, {UNITS}"
+        )
+    return DepthCheck(len(maps), inside, usual, tuple(warnings))
+
+
+def _smallest(view: PosedImage) -> NDArray[np.float32]:
+    """Smallest depth of each pixel and the eight around it ``(H, W)``: inf in background, -1 where one has none."""
+    assert view.depth is not None
+    numbers = view.depth.numbers
+    if view.mask is not None and view.mask.shape == numbers.shape:
+        numbers = np.where(view.mask == 0, np.float32(np.inf), numbers)
+    known = np.nan_to_num(numbers, nan=-1.0, posinf=np.inf).astype(np.float32)
+    return np.asarray(cv2.erode(known, np.ones((3, 3), np.uint8)), np.float32)
+
+
+def _places(depth: DepthMap) -> Float64:
+    """World coordinates ``(N, 3)`` of up to 2,000 readings of a map, evenly over it."""
+    rows = np.flatnonzero(np.isfinite(depth.numbers))
+    rows = rows[np.linspace(0, len(rows) - 1, min(2000, len(rows))).astype(np.int64)] if len(rows) else rows
+    lines = depth.camera.sight_lines().numpy().reshape(-1, 3)[rows]
+    pose = depth.camera.world_from_camera.numpy()
+    return (lines * depth.numbers.reshape(-1)[rows, None].astype(np.float64)) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _seen_through(
+    index: int, places: Float64, maps: Sequence[DepthMap], smallest: Sequence[NDArray[np.float32]], margin: float
+) -> float | None:
+    """Share of one map's readings in whose place four others see something further away; None of fewer than 50."""
+    others = np.delete(np.arange(len(maps)), index)
+    told = through = 0
+    for partner in others[np.linspace(0, len(others) - 1, min(4, len(others))).astype(np.int64)]:
+        pixels, z, framed = maps[partner].camera.in_view(places)
+        column, row = np.rint(pixels[framed]).astype(np.int64).T
+        there = smallest[partner][row, column]
+        known = there > 0
+        told += int(known.sum())
+        through += int((known & (z[framed] < 0.99 * there - margin)).sum())
+    return through / told if told >= 50 else None
+
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -54,25 +146,15 @@ LIMITS = CameraLimits()
 
 @dataclass(frozen=True, eq=False)
 class CameraCheck:
-    """Figures of cameras around a region of interest.
+    """Figures of cameras around a region of interest; None where there are no points, masks or depth maps."""
 
-    Attributes:
-        fields_of_view: ``(V, 2)`` full angles across and down, degrees.
-        distances: ``(V,)`` from the eyes to the middle of the region, in its radii.
-        in_view: ``(V,)`` share of the region's sphere that falls into the image.
-        points_inside: share of the sparse points that lie in the region; None without points.
-        mask_inside: share of the object's pixels whose rays meet the region, in the median view; None without masks.
-        depths: what is known of the depth maps; None without any.
-        warnings: one line each.
-    """
-
-    fields_of_view: Float64
-    distances: Float64
-    in_view: Float64
-    points_inside: float | None
-    mask_inside: float | None
+    fields_of_view: Float64  # (V, 2) full angles across and down, degrees
+    distances: Float64  # (V,) from the eyes to the middle of the region, in its radii
+    in_view: Float64  # (V,) share of the region's sphere that falls into the image
+    points_inside: float | None  # share of the sparse points that lie in the region
+    mask_inside: float | None  # share of the object's pixels whose rays meet the region, in the median view
     depths: DepthCheck | None
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...]  # one line each
 
     def record(self) -> dict[str, Any]:
         """As numbers and lists, for JSON."""
@@ -90,16 +172,9 @@ class CameraCheck:
 def check_files(
     path: str | Path, out: Path | None = None, depths: DepthSource | None = None, *, allow_missing: bool = False
 ) -> tuple[PosedImages, CameraCheck, str]:
-    """Check a data set, and write what it looks like.
+    """Check a data set → its images (made small), the figures, and both in words.
 
-    Args:
-        path: as for `read_posed_images`.
-        out: ``.glb`` or ``.ply`` file for `camera_mesh`, in world coordinates.
-        depths: as for `read_posed_images`.
-        allow_missing: as for `read_posed_images`.
-
-    Returns:
-        The images (made small), the figures, and both in words.
+    A file ``out`` gets `camera_mesh`, in world coordinates. The other arguments are those of `read_posed_images`.
 
     Raises:
         InputError: the data set cannot be read, or the file not be written.
@@ -175,13 +250,7 @@ def check_cameras(images: PosedImages) -> CameraCheck:
 
 
 def format_check(images: PosedImages, check: CameraCheck, sizes: Sequence[tuple[int, int]]) -> str:
-    """The figures in words, a line for each.
-
-    Args:
-        images: what was checked.
-        check: its figures.
-        sizes: widths and heights of the images as they are on disk.
-    """
+    """The figures in words, a line for each; ``sizes`` are widths and heights of the images as they are on disk."""
     distinct = list(dict.fromkeys(sizes))
     size = f"{distinct[0][0]} × {distinct[0][1]}" if len(distinct) == 1 else f"{len(distinct)} sizes"
     scale = images.similarity.scale
@@ -336,3 +405,28 @@ def _brightness(view: PosedImage) -> float:
     light = srgb_to_linear(view.color).mean(axis=-1)
     weight = np.ones_like(light) if view.mask is None or not view.mask.any() else view.mask
     return float((light * weight).sum() / weight.sum())
+
+
+def colmap_report(report: Report | None) -> ColmapReport:
+    """A receiver of COLMAP's progress that passes it on to ``report``."""
+
+    def passed_on(stage: str, done: int, total: int) -> None:
+        (report or silent)(Progress(stage, done, total, done / max(total, 1), {}))
+
+    return passed_on
+
+
+def said_of(found: FoundCameras | FoundPoints) -> tuple[str, list[str]]:
+    """What was found, in a line, and what is to be warned of."""
+    seen, warnings = f"seen {found.error:.2f} pixels off", []
+    if isinstance(found, FoundCameras):
+        placed = found.photographs - len(found.left_out)
+        line = f"{placed} of {found.photographs} photographs placed by {found.points:,} points that are {seen}"
+        if found.left_out:
+            names = ", ".join(found.left_out[:3]) + (", …" if len(found.left_out) > 3 else "")
+            warnings.append(f"not placed: {names}; too little in them is in others too, or they are blurred")
+    else:
+        line = f"{found.points:,} points that {found.photographs} photographs show, {seen}"
+    if found.points < 100:
+        warnings.append(f"{found.points} points are few: cameras may be wrong; see `mplicits check-cameras`")
+    return f"{found.project}: {line}", warnings

@@ -1,7 +1,4 @@
-"""Depths that were measured along rays of the photographs: of depth maps and sparse points, for start and training.
-
-A measurement says two things: where the ray meets the surface, and that nothing is on the way there.
-"""
+"""Measured depths, of depth maps and sparse points: rays that meet the surface, and nothing before it."""
 
 from __future__ import annotations
 
@@ -15,16 +12,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ....datasets.cameras import Camera
-from ....datasets.views.formats.shots import DepthMap
-from ....datasets.views.images import PosedImage, PosedImages
-from ....neural_fields import Field, InputError, sphere_trace
-from ....neural_fields.backend.devices import handed, uniform
-from ....neural_fields.fields.function import FieldLike
-from ....neural_fields.volume.weights import sphere_span
+from ...datasets.cameras import Camera
+from ...datasets.views.formats.shots import DepthMap
+from ...datasets.views.images import PosedImage, PosedImages
+from ...neural_fields import Field, InputError, sphere_trace
+from ...neural_fields.backend.devices import handed, uniform
+from ...neural_fields.fields.function import FieldLike
+from ...neural_fields.volume.weights import sphere_span
 from .silhouettes import OBJECT
-
-__all__ = ["DepthRays", "MeasuredDepths", "depth_loss", "fit_scale_shift", "said_outside"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -52,56 +47,34 @@ LIMITS = DepthLimits()
 
 
 class DepthRays(NamedTuple):
-    """Measured rays in unit-sphere coordinates: they meet the surface at ``origins + reach · directions``.
+    """Measured rays in unit-sphere coordinates: they meet the surface at ``origins + reach · directions``."""
 
-    Attributes:
-        origins: ``(B, 3)``.
-        directions: ``(B, 3)`` unit vectors.
-        reach: ``(B,)`` in radii of the region; not positive where it is not known yet.
-        exact: ``(B,)`` whether it was measured, by a sensor or by triangulation, and not estimated from one picture.
-        view: ``(B,)`` number of the picture.
-    """
-
-    origins: Tensor
-    directions: Tensor
-    reach: Tensor
-    exact: Tensor
-    view: Tensor
+    origins: Tensor  # (B, 3)
+    directions: Tensor  # (B, 3) unit vectors
+    reach: Tensor  # (B,) in radii of the region; not positive where it is not known yet
+    exact: Tensor  # (B,) whether it was measured, by a sensor or by triangulation, not estimated from one picture
+    view: Tensor  # (B,) number of the picture
 
 
 @dataclass(frozen=True)
 class _Part:
-    """Measurements of one view.
+    """Measurements of one view."""
 
-    Attributes:
-        lines: ``(N, 3)`` lines of sight in camera coordinates, z = 1.
-        numbers: ``(N,)`` depths in radii of the region, or numbers of a map.
-        form: how those become depths.
-        exact: see `DepthRays`.
-        view: number of the picture.
-    """
-
-    lines: Float64
-    numbers: Float64
-    form: int
-    exact: bool
-    view: int
+    lines: Float64  # (N, 3) lines of sight in camera coordinates, z = 1
+    numbers: Float64  # (N,) depths in radii of the region, or numbers of a map
+    form: int  # how those become depths
+    exact: bool  # see `DepthRays`
+    view: int  # number of the picture
 
 
 class MeasuredDepths:
-    """The measurements of all views that are trained on.
+    """The measurements of the ``views`` that are trained on, a part of the ``images``.
 
-    Numbers of a map that is not in the cameras' units become depths by a scale and a shift of its own. The sparse
-    points that the view saw say which, if there are sixteen; else `settle` fits them to the surface as it is.
-
-    Args:
-        views: those that are trained on.
-        images: of which these are a part; for the coordinates, the sparse points and the name.
-        device: where the rays are wanted.
-        seed: of the choice where there are more than can be kept.
+    Numbers of a map that is not in the cameras' units become depths by a scale and a shift of its own, `affine` ``(V,
+    2)``, 0 until they are known. The sparse points that the view saw say which, if there are sixteen; else `settle`
+    fits them to the surface as it is. The ``seed`` chooses where there are more readings than can be kept.
 
     Attributes:
-        affine: ``(V, 2)`` scale and shift of each view's map; 0 until they are known.
         is_loose: whether there are maps for `settle`.
         is_exact: whether anything was measured in the cameras' units.
 
@@ -154,11 +127,7 @@ class MeasuredDepths:
 
     @torch.no_grad()
     def settle(self, distance: FieldLike) -> None:
-        """Fit scale and shift of the maps that have none of their own to a surface as it is.
-
-        Args:
-            distance: a field, or a function of points, in unit-sphere coordinates.
-        """
+        """Fit scale and shift of the maps that have none yet to a field in unit-sphere coordinates."""
         loose = self.forms != AS_IT_IS
         # Of each view's readings, evenly; they lie one after the other.
         count = torch.bincount(self.views[loose].long(), minlength=len(self.eyes))
@@ -188,16 +157,10 @@ def _inverse(numbers: Tensor) -> Tensor:
 
 
 def fit_scale_shift(numbers: Tensor, wanted: Tensor, group: Tensor, groups: int) -> Tensor:
-    """Scale a and shift b of each group that minimise Σ |a m + b − z| of its numbers m, ``(groups, 2)`` float64.
+    """Scale a and shift b of each group that minimise Σ |a m + b − z| of ``numbers`` m and ``wanted`` z ``(N,)``.
 
-    By least squares that are weighted again with 1 / |residual|, so that outliers do not count as squares. 0 for groups
-    with fewer than sixteen numbers, with numbers that are all alike, or whose scale would not be positive.
-
-    Args:
-        numbers: ``(N,)``, m.
-        wanted: ``(N,)``, z.
-        group: ``(N,)`` of each.
-        groups: how many there are.
+    Returns ``(groups, 2)`` float64, by least squares that are weighted again with 1 / |residual|. 0 for groups with
+    fewer than sixteen numbers, with numbers that are all alike, or whose scale would not be positive.
     """
     m, z = numbers.double(), wanted.double()
     count = torch.bincount(group, minlength=groups)
@@ -225,18 +188,12 @@ def fit_scale_shift(numbers: Tensor, wanted: Tensor, group: Tensor, groups: int)
 def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: torch.Generator | None = None) -> Tensor:
     """How far a field is from what was measured ``(B,)``: |f(p)|, and Σ max(−f(x), 0) + max(f(x) − |p − x|, 0).
 
-    p is where the ray meets the surface. Two places x are on the way there: one at random, nearer to p more often, and
-    where the ray enters the unit sphere. A distance is 0 at p; on the way it is not negative, and not more than what is
-    left of it. What lies outside the unit sphere, and measurements that are not known yet, count 0.
+    p is where the ray meets the surface. Two places x are on the way there: one at random (without a ``generator`` in
+    the middle), nearer to p more often, and where the ray enters the unit sphere. What lies outside the unit sphere,
+    and measurements that are not known yet, count 0.
 
-    Where rays enter has to be said: volume rendering divides by the light that is left there (NeuS, Eq. 13), so that
-    one which enters inside of something passes it, and the pictures alone leave slabs before the cameras.
-
-    Args:
-        field: f, in unit-sphere coordinates.
-        rays: the measurements.
-        level: of the field.
-        generator: of the places, on the CPU; without, they are in the middle of the way.
+    The entry has to be named: volume rendering divides by the light that is left there (NeuS, Eq. 13), and the pictures
+    alone leave slabs before the cameras.
     """
     origins, directions, reach = rays[:3]
     near, far = sphere_span(origins, directions)
@@ -333,23 +290,16 @@ def _pixels(camera: Camera, lines: Float64) -> tuple[Int64, Int64, NDArray[np.bo
 
 
 def said_outside(share: float) -> str | None:
-    """What is said if hardly a depth of maps in the cameras' units ends in the region; None if enough of them do.
-
-    Args:
-        share: of the readings of all maps, that do.
-    """
+    """A warning if too small a share of the depths of maps in the cameras' units ends in the region; else None."""
     if share >= LIMITS.inside:
         return None
     return f"{share:.1%} of the depths in all maps end in the region of interest; {UNITS}"
 
 
 def _check_units(source: Path, in_region: Sequence[float], ratios: Sequence[Float64]) -> None:
-    """Whether maps that are said to be in the cameras' units can be.
+    """Refuse maps that cannot be in the cameras' units.
 
-    Args:
-        source: one of the files.
-        in_region: share of each map's readings that end in the region.
-        ratios: of depths in each map to those of sparse points there.
+    By the share of each map's readings that end in the region, and the ratios of its depths to those of sparse points.
     """
     if outside := said_outside(float(np.mean(in_region))):
         raise InputError(f"{source}: {outside}")

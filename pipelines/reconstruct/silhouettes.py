@@ -13,11 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ....datasets.cameras import Camera
-from ....datasets.views.images import PosedImage
-from ....neural_fields import Similarity
-
-__all__ = ["OBJECT", "Agreement", "Limits", "grid_in_ball", "named", "silhouettes"]
+from ...datasets.cameras import Camera
+from ...datasets.views.images import PosedImage
+from ...neural_fields import Similarity
 
 OBJECT = 0.5  # a pixel with a larger share of object counts as one
 
@@ -49,32 +47,17 @@ def grid_in_ball(resolution: int) -> tuple[Tensor, Tensor]:
 def silhouettes(
     views: Sequence[PosedImage], similarity: Similarity, points: Tensor, edge: float
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """For each view, which points it sees and which of them are object ``(N,)``, each.
-
-    Args:
-        views: pictures with masks.
-        similarity: from world to unit-sphere coordinates.
-        points: ``(N, 3)`` float64 in the latter.
-        edge: a point is object where there is object within half of it.
-    """
+    """For each view, which points ``(N, 3)`` it sees, and which have object within half an ``edge``, ``(N,)`` each."""
     for view in views:
         camera, mask = view.camera.moved(similarity), _object_in(view)
         cut = bool(_border(mask).any())
-        mask = torch.from_numpy(_widened(mask, camera, 0.5 * edge, edge))
-        row, column, depth, inside = _pixels(camera, points)
+        mask = _widened(mask, camera, 0.5 * edge, edge)
+        pixels, depth, inside = camera.in_view(points.numpy())
+        column, row = np.rint(pixels[inside]).astype(np.int64).T
+        objects = inside.copy()
+        objects[inside] = mask[row, column]
         # What a picture does not show is no object, unless its rim cuts the object.
-        yield (
-            inside if cut else depth > 0,
-            inside & mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)],
-        )
-
-
-def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rows, columns and depths of points ``(N, 3)``, and which of them are in the picture ``(N,)``, each."""
-    pixels, depth = camera.project(points)
-    column, row = pixels.round().long().unbind(dim=1)
-    inside = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    return row, column, depth, inside
+        yield torch.from_numpy(inside if cut else depth > 0), torch.from_numpy(objects)
 
 
 def _widened(mask: NDArray[np.bool_], camera: Camera, length: float, nearest: float) -> NDArray[np.bool_]:
@@ -89,20 +72,13 @@ class Agreement:
     """What silhouettes say of the same points, and which of them the others contradict.
 
     A view contradicts a point that it sees and takes for background.
-
-    Attributes:
-        views: pictures, all with masks.
-        similarity: from world to unit-sphere coordinates.
-        seen: which points of a grid in the unit ball each view sees ``(V, N)``.
-        against: which of them it contradicts ``(V, N)``.
-        limits: when a silhouette is wrong.
     """
 
-    views: Sequence[PosedImage]
-    similarity: Similarity
-    seen: Tensor
-    against: Tensor
-    limits: Limits = Limits()
+    views: Sequence[PosedImage]  # pictures, all with masks
+    similarity: Similarity  # from world to unit-sphere coordinates
+    seen: Tensor  # (V, N) which points of a grid in the unit ball each view sees
+    against: Tensor  # (V, N) which of them it contradicts
+    limits: Limits = Limits()  # when a silhouette is wrong
 
     @classmethod
     def of(cls, views: Sequence[PosedImage], similarity: Similarity, limits: Limits | None = None) -> Agreement:
@@ -151,11 +127,7 @@ class Agreement:
         return rest.without(rest._those(rest._cuts_alone)).views
 
     def holes(self) -> dict[int, NDArray[np.bool_]]:
-        """Holes in masks: background with object all around it, where all other views take for object what is behind.
-
-        Returns:
-            By the number of the view, for those that have any, pixels ``(H, W)``.
-        """
+        """Holes ``(H, W)`` in masks, by the view's number: enclosed background where all others see object."""
         alone = self.against & (self.against.sum(dim=0) == 1)
         points, found = grid_in_ball(self.limits.cells)[0], {}
         for index in self._cuts_alone.nonzero()[:, 0].tolist():
@@ -200,9 +172,10 @@ class Agreement:
     def _shadow(self, view: PosedImage, points: Tensor) -> NDArray[np.bool_]:
         """Where a view sees points ``(N, 3)``, and all within a cell of them ``(H, W)``."""
         camera, edge = view.camera.moved(self.similarity), 2 / self.limits.cells
-        row, column, _, inside = _pixels(camera, points)
+        pixels, _, inside = camera.in_view(points.numpy())
+        column, row = np.rint(pixels[inside]).astype(np.int64).T
         there = np.zeros((camera.height, camera.width), dtype=bool)
-        there[row[inside].numpy(), column[inside].numpy()] = True
+        there[row, column] = True
         return _widened(there, camera, edge, edge)
 
 

@@ -11,11 +11,10 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields.backend.devices import Supply
 from mplicits.neural_fields.networks.sphere_init import fit_sphere
-from mplicits.pipelines.reconstruct.data.measured import MeasuredDepths
-from mplicits.pipelines.reconstruct.model import model as scene_model
-from mplicits.pipelines.reconstruct.model.model import RayPool, build_scene
-from mplicits.pipelines.reconstruct.model.objective import SceneObjective
-from mplicits.pipelines.reconstruct.model.replayed import ReplayedTrainer
+from mplicits.pipelines.reconstruct import model as scene_model
+from mplicits.pipelines.reconstruct.measured import MeasuredDepths
+from mplicits.pipelines.reconstruct.model import RayPool, build_scene
+from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective
 from mplicits.pipelines.training.replay import Again, CudaGraphs, Recorder, Replays, Results, Work
 from mplicits.pipelines.training.trainer import Trainer
 from reconstructions import QUICK, TINY_SCENE

@@ -10,21 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ....datasets.cameras import Camera
-from ....datasets.views.images import PosedImage
-from ....neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
-from ....neural_fields.backend.devices import handed, precise
-from ....neural_fields.networks.hash_encoding import HashEncoding
-from ....neural_fields.networks.neus_mlp import NeusSDF
-from ....neural_fields.networks.radiance import Outside, Radiance, ViewColor
-from ....neural_fields.networks.sphere_init import fit_sphere
-from ....neural_fields.volume.render import Rendered, Sampling, render_volume
-from ....neural_fields.volume.weights import sphere_span
-from ...training.focus import Focus
-from ...training.settings import ReconstructConfig
-from ...training.trainer import seeded
-
-__all__ = ["Exposures", "PoseCorrections", "RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
+from ...datasets.cameras import Camera
+from ...datasets.views.images import PosedImage
+from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
+from ...neural_fields.backend.devices import handed, precise
+from ...neural_fields.networks.hash_encoding import HashEncoding
+from ...neural_fields.networks.neus_mlp import NeusSDF
+from ...neural_fields.networks.radiance import Outside, Radiance, ViewColor
+from ...neural_fields.networks.sphere_init import fit_sphere
+from ...neural_fields.volume.render import Rendered, Sampling, render_volume
+from ...neural_fields.volume.weights import sphere_span
+from ..training.settings import ReconstructConfig
+from ..training.trainer import Focus, seeded
 
 # Kinds of devices on which matrix products of colours are in bfloat16.
 HALF_PRECISION = ("cuda",)
@@ -33,11 +30,8 @@ HALF_PRECISION = ("cuda",)
 class Exposures(nn.Module):
     """Brightness and white balance of each photograph: p = g_v c + o_v for each channel, g_v > 0.
 
-    A longer exposure multiplies light, and display RGB is nearly a power of it: that is a gain again. The geometric
-    mean of all gains is 1 and the mean of all offsets 0, so that colours stay those of the usual photograph.
-
-    Args:
-        views: how many photographs there are.
+    The geometric mean of all gains is 1 and the mean of all offsets 0, so that colours stay those of the usual
+    photograph.
     """
 
     def __init__(self, views: int) -> None:
@@ -53,9 +47,6 @@ class PoseCorrections(nn.Module):
     """Small rotations and shifts of the cameras: v → exp([ω_v]×) v for directions, o → o + t_v for eyes.
 
     The means of all ω and of all t are 0, so that the scene as a whole stays where it is (to the first order).
-
-    Args:
-        views: how many cameras there are.
     """
 
     def __init__(self, views: int) -> None:
@@ -84,13 +75,7 @@ class PoseCorrections(nn.Module):
 class SceneModel(nn.Module):
     """Everything that a pixel's colour depends on, in unit-sphere coordinates.
 
-    Args:
-        geometry: f.
-        color: colour of its surface.
-        outside: what is outside the unit sphere; None if nothing is.
-        background: ``(3,)`` behind everything.
-        exposures: of the photographs; None if all are alike.
-        poses: corrections of the cameras; None if they are right.
+    ``outside`` is the background field, None without one; ``background`` ``(3,)`` is the colour behind everything.
     """
 
     def __init__(
@@ -227,23 +212,14 @@ def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -
 
 
 class Rays(NamedTuple):
-    """Rays in unit-sphere coordinates, and what the pictures say about them.
+    """Rays in unit-sphere coordinates, and what the pictures say about them."""
 
-    Attributes:
-        origins: ``(R, 3)``.
-        directions: ``(R, 3)`` unit vectors.
-        color: ``(R, 3)`` display RGB in [0, 1].
-        mask: ``(R,)`` how much of the pixel is object; 1 everywhere if nobody said.
-        view: ``(R,)`` number of the picture.
-        row: ``(R,)`` number of the pixel in the pool.
-    """
-
-    origins: Tensor
-    directions: Tensor
-    color: Tensor
-    mask: Tensor
-    view: Tensor
-    row: Tensor
+    origins: Tensor  # (R, 3)
+    directions: Tensor  # (R, 3) unit vectors
+    color: Tensor  # (R, 3) display RGB in [0, 1]
+    mask: Tensor  # (R,) how much of the pixel is object; 1 everywhere without masks
+    view: Tensor  # (R,) number of the picture
+    row: Tensor  # (R,) number of the pixel in the pool
 
 
 def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
@@ -253,16 +229,10 @@ def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 class RayPool:
-    """The pixels whose rays meet the unit sphere; or all of them, where what lies outside is learnt too.
+    """The pixels whose rays meet the unit sphere; ``whole``: all of them, where what lies outside is learnt too.
 
-    Directions are worked out when rays are drawn, from the pixel's number: of all pixels only the colours are kept.
-
-    Args:
-        views: the pictures.
-        similarity: from world to unit-sphere coordinates.
-        device: where the rays are wanted.
-        whole: keep the pixels that do not see the region, too.
-        left_out: by the number of a view, pixels of it that are not kept ``(H, W)``.
+    Of a view, by its number, pixels ``(H, W)`` are ``left_out``. Of all pixels only the colours are kept; directions
+    follow from the pixel's number when rays are drawn.
 
     Raises:
         InputError: no ray of any picture meets the region of interest.

@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from mplicits.pipelines.training import budget as module
-from mplicits.pipelines.training.budget import BUDGET, Budget, affordable, step_seconds
+from mplicits.pipelines.training import scaffold as module
+from mplicits.pipelines.training.scaffold import BUDGET, Budget, affordable, step_seconds
 
 STEPS, COSTS = (1000, 500, 500), (0.01, 0.02, 0.04)  # 10 s, 10 s, 20 s
 

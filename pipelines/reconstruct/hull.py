@@ -11,18 +11,51 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor, nn
 
-from ....datasets.views.images import PosedImage, PosedImages
-from ....neural_fields import InputError, MultiscaleSDF, Similarity, Siren
-from ....neural_fields.fields.losses import data_loss, eikonal_loss
-from ....neural_fields.networks.value_grid import ValueGrid
-from ...training.settings import ReconstructConfig
-from ...training.trainer import seeded
-from ..data.measured import MeasuredDepths
-from ..data.silhouettes import Agreement, grid_in_ball, silhouettes
-from ..model.model import SceneModel
-from .free_space import seen_through
+from ...datasets.views.images import PosedImage, PosedImages
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
+from ...neural_fields.fields.losses import data_loss, eikonal_loss
+from ...neural_fields.networks.value_grid import ValueGrid
+from ...neural_fields.volume.weights import sphere_span
+from ..training.settings import ReconstructConfig
+from ..training.trainer import seeded
+from .measured import MeasuredDepths
+from .model import SceneModel
+from .silhouettes import Agreement, grid_in_ball, silhouettes
 
-__all__ = ["begin", "carve", "fitting_resolution", "start_at_hull"]
+
+def seen_through(measured: MeasuredDepths, resolution: int, *, rays: int = 1 << 18, least: int = 2) -> Tensor:
+    """Which vertices of a grid over [−1, 1]³ measured rays pass ``(resolution + 1,) * 3``, on the CPU.
+
+    A vertex is passed where at least ``least`` of up to ``rays`` rays go through the cell around it before they end
+    beyond it, and no fewer than end there: one wrong measurement carves no hole. Right measurements pass no vertex that
+    lies deeper inside than half the diagonal of a cell. Rays whose depth is not known yet are left out.
+    """
+    count, edge = resolution + 1, 2 / resolution
+    passed, ended = (torch.zeros(count**3, dtype=torch.int64, device=measured.device) for _ in range(2))
+    rows = torch.arange(len(measured), device=measured.device)[:: max(1, len(measured) // rays)]
+    steps = torch.arange(round(2 / edge) * 2, device=measured.device) * (edge / 2)
+    for part in rows.split(1 << 14):
+        origins, directions, reach = measured.at(part)[:3]
+        near, far = sphere_span(origins, directions)
+        depths = near[:, None] + steps
+        # Not the last cell and a half: that is where the surface is, as well as it was measured.
+        kept = depths < torch.minimum(reach - 1.5 * edge, far)[:, None]
+        places = origins[:, None] + depths[..., None] * directions[:, None]
+        cells = _cell(places, resolution)
+        # Half-cell steps meet a cell more than once; a ray counts once.
+        first = torch.ones_like(kept)
+        first[:, 1:] = cells[:, 1:] != cells[:, :-1]
+        passed += torch.bincount(cells[kept & first], minlength=count**3)
+        inside = (reach > near) & (reach < far)
+        ends = _cell(origins + reach[:, None] * directions, resolution)
+        ended += torch.bincount(ends[inside], minlength=count**3)
+    return ((passed >= least) & (passed >= ended)).reshape(count, count, count).cpu()
+
+
+def _cell(points: Tensor, resolution: int) -> Tensor:
+    """Number of the vertex that is next to each point ``(...,)``."""
+    x, y, z = ((points.clamp(-1, 1) + 1) * (0.5 * resolution)).round().long().unbind(dim=-1)
+    return (x * (resolution + 1) + y) * (resolution + 1) + z
 
 
 @dataclass(frozen=True)
@@ -59,19 +92,10 @@ def begin(
     measured: MeasuredDepths | None = None,
     agreement: Agreement | None = None,
 ) -> str:
-    """Give an untrained scene the start that its settings ask for; it is a sphere already.
+    """Give an untrained scene, in place, the start that its settings ask for; it is a sphere already.
 
-    Args:
-        model: its geometry is trained in place.
-        views: those that are trained on.
-        images: of which these are a part; for the coordinates and the name.
-        config: ``start``, ``geometry`` and ``seed`` are used.
-        measured: depths of these views, if there are any.
-        agreement: of these views, if it is known.
-
-    Returns:
-        What it is now: "hull", "depths" (what no measured ray passes) or "sphere". A hull is carved by measured rays
-        too, unless it was asked for by name.
+    Returns "hull" (carved by measured rays too, unless it was asked for by name), "depths" (what no measured ray
+    passes) or "sphere". ``agreement`` is that of the ``views``, if it is known.
 
     Raises:
         InputError: a start was asked for that there is not.
@@ -108,18 +132,12 @@ def carve(
     """Signed distances to what is left of the unit ball at the vertices of a grid over [−1, 1]³, negative inside.
 
     A vertex of the unit ball is inside where `HullOptions.agree` of the views that see it find object within half a
-    cell. So the hull is up to a cell too large, and thin parts stay. Grids of half as many cells come first, which see
-    object from further around, so that most vertices are decided by a few.
-
-    Args:
-        views: pictures with masks; none leaves all that is not empty.
-        similarity: from world to unit-sphere coordinates.
-        resolution: cells along an edge; None takes `fitting_resolution`, or that of ``empty`` where there are no views.
-        empty: ``(E, E, E)`` vertices of a grid over the same cube that are known to be outside.
+    cell, so that thin parts stay; without views, where ``empty`` ``(E, E, E)``, a grid over the same cube, does not
+    exclude it. Grids of half as many cells come first, so that most vertices are decided by a few.
 
     Returns:
-        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; or None where too little or too
-        much of the ball is left, as by empty and full masks.
+        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; None where too little or too much of
+        the ball is left, as by empty and full masks.
     """
     if resolution is None:
         resolution = fitting_resolution(views, similarity) if views or empty is None else len(empty) - 1
@@ -192,14 +210,7 @@ def _all_around(empty: NDArray[np.bool_], resolution: int) -> NDArray[np.bool_]:
 
 
 def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int = 0, steps: int = HULL.steps) -> None:
-    """Train a SIREN in place to signed distances on a grid, smoothed as far as it cannot follow them.
-
-    Args:
-        network: the coarse level, on any device.
-        distances: as `carve` returns them.
-        seed: of the points.
-        steps: of Adam, its rate falling linearly.
-    """
+    """Train a SIREN in place to the distances of `carve`, smoothed as far as it cannot follow."""
     place = network.output.weight
     grid = ValueGrid(len(distances) - 1, place.device)
     grid.kept.copy_(torch.from_numpy(distances).to(place))

@@ -11,7 +11,7 @@ from mplicits.datasets.views.formats.shots import DepthKind
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import InputError, Jet, Similarity, Sphere, Union, render_volume
 from mplicits.neural_fields.volume.render import Sampling
-from mplicits.pipelines.reconstruct.data.measured import LIMITS, DepthRays, MeasuredDepths, depth_loss, fit_scale_shift
+from mplicits.pipelines.reconstruct.measured import LIMITS, DepthRays, MeasuredDepths, depth_loss, fit_scale_shift
 from torch import Tensor
 
 CPU = torch.device("cpu")

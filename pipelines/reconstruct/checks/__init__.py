@@ -1,1 +1,0 @@
-"""Whether posed photographs can be right."""

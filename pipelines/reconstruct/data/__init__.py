@@ -1,1 +1,0 @@
-"""What photographs offer to a reconstruction: depths, silhouettes, visibility."""

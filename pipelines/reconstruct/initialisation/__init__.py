@@ -1,1 +1,0 @@
-"""The geometry that a reconstruction begins with."""

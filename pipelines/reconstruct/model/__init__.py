@@ -1,1 +1,0 @@
-"""The scene that is trained, its loss, and its steps."""
