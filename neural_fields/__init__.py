@@ -7,8 +7,7 @@ from typing import Any
 from .backend.errors import InputError
 from .checkpoint import load_field, load_texture, save_field
 from .fields.csg import Difference, Intersection, Offset, Shell, Union
-from .fields.field import Field, Jet
-from .fields.function import FunctionField
+from .fields.field import Field, FunctionField, Jet
 from .fields.primitives import Box, Capsule, Plane, Sphere, Torus
 from .fields.similarity import Similarity
 from .hosts.adapters import InstantNSRGeometry, NerfstudioField, NeuSGeometry
@@ -75,8 +74,7 @@ _MOVED = {
     "backend.fixed_shapes": "FixedShapes fixed_shapes",
     "checkpoint": "SavedField load_radiance save_radiance save_texture",
     "fields.csg": "Bounded Placed",
-    "fields.field": "OneLevelField SecondJet",
-    "fields.function": "FieldLike as_field",
+    "fields.field": "FieldLike OneLevelField SecondJet as_field",
     "hosts.adapters": "Deviation",
     "hosts.learning_rates": "parameter_groups share_rate=rescale_parameters",
     "meshing.extract": "map_normals",

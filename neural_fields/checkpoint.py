@@ -1,4 +1,4 @@
-"""Fields on disk: safetensors with a description in its header. No pickle, nothing executed on loading."""
+"""Fields on disk: safetensors with a description in the header. No pickle, nothing executed on loading."""
 
 from __future__ import annotations
 
@@ -32,23 +32,9 @@ from .networks.siren import Siren
 from .networks.texture import ColorSiren, TextureField
 from .spacetime.field import SpaceTimeSDF
 
-__all__ = [
-    "SavedField",
-    "checksum_of",
-    "field_bytes",
-    "load_field",
-    "load_radiance",
-    "load_texture",
-    "radiance_bytes",
-    "save_field",
-    "save_radiance",
-    "save_texture",
-    "texture_bytes",
-]
-
 M = TypeVar("M", bound=nn.Module)
 
-# Types by name. Networks and closed forms are made again from their definition, combinations also from their parts.
+# Types by name: built from their definition, combinations also from their parts.
 NETWORKS: Mapping[str, Callable[..., Field]] = {cls.__name__: cls for cls in (Siren, NeusSDF)}
 CLOSED: Mapping[str, Callable[..., Field]] = {cls.__name__: cls for cls in (Box, Capsule, Plane, Sphere, Torus)}
 COMBINED: Mapping[str, Callable[..., Field]] = {
@@ -58,16 +44,16 @@ FILE_VERSION = 1
 
 
 class _Kind(NamedTuple):
-    """A kind of file: what is in it, the command that writes it, its usual name, and what to do if it is damaged."""
+    """A kind of file."""
 
-    thing: str
-    command: str
-    name: str
-    remedy: str
+    thing: str  # its content
+    command: str  # that writes it
+    name: str  # its usual name
+    remedy: str  # if it is damaged
 
     @property
     def key(self) -> str:
-        """Of the description in the file's metadata."""
+        """Key of the description in the file's metadata."""
         return f"mplicits-{self.thing.split()[-1]}"
 
 
@@ -84,12 +70,12 @@ OUTSIDE_SIZES = ("width", "depth", "point_frequencies", "view_frequencies")
 
 
 class SavedField(NamedTuple):
-    """What a checkpoint holds.
+    """Content of a checkpoint.
 
     Attributes:
-        field: the field, on the CPU (or the device asked for), in unit-sphere coordinates.
-        similarity: the way back to the input's coordinates.
-        metadata: whatever the writer added; JSON values.
+        field: on the device asked for, in unit-sphere coordinates.
+        similarity: from input to unit-sphere coordinates.
+        metadata: JSON values of the writer.
     """
 
     field: Field
@@ -104,10 +90,17 @@ def save_field(
     similarity: Similarity | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write the `field_bytes` of ``field`` to a safetensors file, whole or not at all.
+    """Write ``field`` to a safetensors file, whole or not at all.
+
+    Args:
+        path: the file; replaced.
+        field: a `Siren`, a `MultiscaleSDF` of them, a `SpaceTimeSDF` of that, a closed form such as `Sphere`, or a
+            combination of these such as `Union`.
+        similarity: from input to unit-sphere coordinates; the identity by default.
+        metadata: JSON values to keep with the field.
 
     Raises:
-        TypeError: a field of this type has no description on disk.
+        TypeError: a field of this type cannot be described on disk.
     """
     write_whole(Path(path), field_bytes(field, similarity=similarity, metadata=metadata))
 
@@ -115,17 +108,7 @@ def save_field(
 def field_bytes(
     field: Field, *, similarity: Similarity | None = None, metadata: Mapping[str, Any] | None = None
 ) -> bytes:
-    """What a file of a field holds.
-
-    Args:
-        field: a `Siren`, a `MultiscaleSDF` of them, a `SpaceTimeSDF` of that, a closed form such as `Sphere`, or what
-            `Union`, `Difference`, `Offset` and the like make of all these.
-        similarity: the map from input to unit-sphere coordinates; the identity if there is none.
-        metadata: JSON values to keep with the field.
-
-    Raises:
-        TypeError: a field of this type has no description on disk.
-    """
+    """Content of a file of `save_field`, with the same arguments and errors."""
     similarity = similarity or Similarity.identity()
     header = {
         "field": _describe(field),
@@ -146,25 +129,18 @@ def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cp
         field = _build(header["field"], tensors)
         _restore(path, field, tensors, "fit the field again")
         similarity = _similarity(header["similarity"])
-        if not isinstance(header["metadata"], dict):
-            raise TypeError(f"metadata is a {type(header['metadata']).__name__}")
         return SavedField(field.to(device).requires_grad_(False), similarity, header["metadata"])
 
 
 def save_texture(
     path: str | os.PathLike[str], texture: TextureField, *, metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a texture, without its geometry, to a safetensors file, whole or not at all; see `texture_bytes`."""
+    """Write a texture, without its geometry, to a safetensors file, whole or not at all."""
     write_whole(Path(path), texture_bytes(texture, metadata=metadata))
 
 
 def texture_bytes(texture: TextureField, *, metadata: Mapping[str, Any] | None = None) -> bytes:
-    """What a file of a texture holds.
-
-    Args:
-        texture: its geometry is not stored; a digest of it is, so that no other geometry gets these colours.
-        metadata: JSON values to keep with it.
-    """
+    """Content of a file of `save_texture`; a digest of the geometry binds the colours to it."""
     siren = texture.network.siren
     header = {
         "network": {"width": siren.width, "depth": siren.depth, "omega": siren.omega, "in_dim": siren.in_dim},
@@ -176,11 +152,7 @@ def texture_bytes(texture: TextureField, *, metadata: Mapping[str, Any] | None =
 
 
 def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
-    """Read what `save_texture` wrote, and put it around its geometry.
-
-    Args:
-        path: a file written by `save_texture`.
-        geometry: the field that the texture was trained on; left as it is. The texture is put on its device.
+    """Read what `save_texture` wrote, around ``geometry``, the field that it was trained on, and on its device.
 
     Raises:
         InputError: there is no such file, it is damaged, no texture, or one of another geometry.
@@ -188,8 +160,7 @@ def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
     path = Path(path)
     device = geometry.like.device
     with _reading(path, _TEXTURE, device) as (header, tensors):
-        if header["geometry"]["digest"] != _digest(geometry):
-            raise InputError(f"{path}: the texture of another field than this one; run `mplicits texture` again")
+        _check_geometry(path, header, geometry, _TEXTURE)
         sizes = dict(header["network"])
         _check_size(sizes, tensors)
         network = ColorSiren(sizes.pop("width"), sizes.pop("depth"), **sizes)
@@ -210,18 +181,12 @@ def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
 def save_radiance(
     path: str | os.PathLike[str], radiance: Radiance, geometry: Field, *, metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write what rays see of a geometry to a safetensors file, whole or not at all; see `radiance_bytes`."""
+    """Write the radiance of a geometry to a safetensors file, whole or not at all."""
     write_whole(Path(path), radiance_bytes(radiance, geometry, metadata=metadata))
 
 
 def radiance_bytes(radiance: Radiance, geometry: Field, *, metadata: Mapping[str, Any] | None = None) -> bytes:
-    """What a file of a radiance holds.
-
-    Args:
-        radiance: colours by direction, and what is behind.
-        geometry: of it; not stored but as a digest, so that no other geometry gets these colours.
-        metadata: JSON values to keep with it.
-    """
+    """Content of a file of `save_radiance`; a digest of the geometry binds the colours to it."""
     color, outside = radiance.color, radiance.outside
     header = {
         "color": _radiant_of(color, COLOR_SIZES),
@@ -237,11 +202,7 @@ def radiance_bytes(radiance: Radiance, geometry: Field, *, metadata: Mapping[str
 
 
 def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radiance, dict[str, Any]]:
-    """Read what `save_radiance` wrote, and its metadata.
-
-    Args:
-        path: a file written by `save_radiance`.
-        geometry: the field that was trained with it; left as it is. All of the radiance is put on its device.
+    """Read what `save_radiance` wrote, and its metadata, onto the device of ``geometry``, which was trained with it.
 
     Raises:
         InputError: there is no such file, it is damaged, no radiance, or one of another geometry.
@@ -249,27 +210,23 @@ def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radian
     path = Path(path)
     device = geometry.like.device
     with _reading(path, _RADIANCE, device) as (header, tensors):
-        if header["geometry"]["digest"] != _digest(geometry):
-            raise InputError(f"{path}: the colours of another field than this one; run `mplicits reconstruct` again")
+        _check_geometry(path, header, geometry, _RADIANCE)
         inv_std = float(header["inv_std"])
         if not 0 < inv_std < math.inf or tensors["background"].shape != (3,):
             raise ValueError(f"inv_std {inv_std:g}, background of shape {tuple(tensors['background'].shape)}")
         color = _radiant(path, ViewColor, "color", header, tensors)
         outside = None if header["outside"] is None else _radiant(path, Outside, "outside", header, tensors)
-        metadata = header["metadata"]
-        if not isinstance(metadata, dict):
-            raise TypeError(f"metadata is a {type(metadata).__name__}")
-        return Radiance(color, outside, tensors["background"], inv_std), metadata
+        return Radiance(color, outside, tensors["background"], inv_std), header["metadata"]
 
 
 def _radiant_of(network: ViewColor | Outside, sizes: Sequence[str]) -> dict[str, Any]:
-    """What `_radiant` needs to construct one again."""
+    """Arguments of the network, from which `_radiant` makes it again."""
     grid = None if network.grid is None else _grid_of(network.grid)
     return {name: getattr(network, name) for name in sizes} | {"grid": grid}
 
 
 def _grid_of(grid: HashEncoding) -> dict[str, Any]:
-    """What `_made_grid` needs to construct one again."""
+    """Arguments of the encoding, from which `_made_grid` makes it again."""
     return {
         "levels": len(grid.resolutions),
         "table_size": grid.table_size,
@@ -283,7 +240,7 @@ def _grid_of(grid: HashEncoding) -> dict[str, Any]:
 def _radiant(
     path: Path, kind: Callable[..., M], name: str, header: Mapping[str, Any], tensors: Mapping[str, Tensor]
 ) -> M:
-    """A network of a radiance, of its description and its tensors."""
+    """A network of a radiance, from its description and tensors."""
     own = {key.removeprefix(f"{name}."): held for key, held in tensors.items() if key.startswith(f"{name}.")}
     sizes = dict(header[name])
     grid = sizes.pop("grid")
@@ -294,7 +251,7 @@ def _radiant(
 
 
 def _made_grid(described: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> HashEncoding:
-    """An untrained one, unless it has more numbers than the file."""
+    """An untrained encoding; ValueError if it would have more numbers than the file."""
     _check_size({"levels": described["levels"], "features": described["features"]}, tensors)
     resolutions = grid_resolutions(described["levels"], described["coarsest"], described["finest"])
     entries = sum(min((cells + 1) ** 3, described["table_size"]) for cells in resolutions)
@@ -309,6 +266,11 @@ def _digest(field: Field) -> str:
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().float().contiguous().numpy().tobytes())
     return digest.hexdigest()
+
+
+def _check_geometry(path: Path, header: Mapping[str, Any], geometry: Field, kind: _Kind) -> None:
+    if header["geometry"]["digest"] != _digest(geometry):
+        raise InputError(f"{path}: {kind.thing} of another field than this one; run `{kind.command}` again")
 
 
 def checksum_of(tensors: Mapping[str, Tensor]) -> str:
@@ -330,7 +292,7 @@ def _packed(state: Mapping[str, Tensor], kind: _Kind, header: Mapping[str, Any])
 
 @contextmanager
 def _reading(path: Path, kind: _Kind, device: torch.device | str) -> Iterator[tuple[dict[str, Any], dict[str, Tensor]]]:
-    """Header and tensors of a file; whatever goes wrong with them becomes an `InputError`."""
+    """Header and tensors of a file; any error in the block becomes an `InputError`."""
     thing, command = kind.thing, kind.command
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected {thing} written by `{command}` ({kind.name})")
@@ -345,6 +307,8 @@ def _reading(path: Path, kind: _Kind, device: torch.device | str) -> Iterator[tu
                     f"{path}: {thing.split()[-1]} format version {header['version']}; this mplicits reads version "
                     f"{FILE_VERSION}, so write it again with `{command}` or install the version that wrote it"
                 )
+            if not isinstance(header["metadata"], dict):
+                raise TypeError(f"metadata is a {type(header['metadata']).__name__}")
             held = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             if header.get("checksum") not in (None, checksum_of(held)):  # older files have none
                 raise InputError(f"{path}: damaged (its numbers are not those that were written); {kind.remedy}")
@@ -352,13 +316,13 @@ def _reading(path: Path, kind: _Kind, device: torch.device | str) -> Iterator[tu
         yield header, tensors
     except InputError:
         raise
-    except Exception as error:  # whatever a head that somebody else wrote can make of our constructors
+    except Exception as error:  # a foreign header may make constructors fail in any way
         reason = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: damaged, or not {thing} written by `{command}` ({reason})") from error
 
 
 def _restore(path: Path, module: nn.Module, tensors: Mapping[str, Tensor], remedy: str) -> None:
-    """Load the tensors in their own precision, and refuse those that are not finite."""
+    """Load tensors in their own precision, and refuse those that are not finite."""
     for tensor in tensors.values():
         if tensor.is_floating_point():
             module.to(dtype=tensor.dtype)
@@ -369,7 +333,7 @@ def _restore(path: Path, module: nn.Module, tensors: Mapping[str, Tensor], remed
 
 
 def _describe(field: Field) -> dict[str, Any]:
-    """What `_build` needs to construct an untrained copy."""
+    """The arguments from which `_build` makes an untrained copy."""
     if isinstance(field, MultiscaleSDF):
         levels = [_describe(level) for level in field.levels]
         return {"type": "MultiscaleSDF", "taper": field.taper, "levels": levels}
@@ -401,11 +365,7 @@ def _similarity(described: Mapping[str, Any]) -> Similarity:
 
 
 def _check_size(arguments: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-    """Refuse a network that cannot have come from these tensors, before one is made.
-
-    Raises:
-        ValueError: a whole number of its description is larger than all that the file holds.
-    """
+    """Raise ValueError if a whole number of a description is larger than the file allows."""
     held = sum(tensor.numel() for tensor in tensors.values())
     for name, number in arguments.items():
         most = len(tensors) if name == "depth" else held

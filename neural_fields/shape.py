@@ -1,4 +1,4 @@
-"""A field asked in the coordinates and units of its input, in numpy or in torch."""
+"""A field in the coordinates and units of its input, in numpy or in torch."""
 
 from __future__ import annotations
 
@@ -13,25 +13,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .fields.csg import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
-from .fields.field import Field
-from .fields.function import FieldLike, as_field
+from .fields.field import Field, FieldLike, solid
 from .fields.similarity import Similarity
-from .meshing._lattice import Bounds
+from .meshing._cells import Bounds
 from .meshing.extract import DEFAULT_BOUNDS, Mesh, extract_mesh
 from .tracing.projection import project_to_surface
 from .tracing.sphere import sphere_trace
 from .upward import upward
 
-__all__ = ["Closest", "WorldField", "WorldHits", "in_one_frame"]
-
 Points = TypeVar("Points", NDArray[np.floating], Tensor)
 
 
 class Closest(NamedTuple):
-    """Points of a surface near given ones, as arrays or tensors.
+    """Points of a surface near given ones, as arrays or tensors, in input coordinates.
 
     Attributes:
-        position: ``(..., 3)`` where `WorldField.closest` ended, in input coordinates.
+        position: ``(..., 3)`` where `WorldField.closest` ended.
         normal: ``(..., 3)`` unit normal there, outward.
         reached: ``(...,)`` bool, whether that is on the surface.
     """
@@ -42,7 +39,7 @@ class Closest(NamedTuple):
 
 
 class WorldHits(NamedTuple):
-    """Where rays meet a surface, as arrays or tensors, in input coordinates and units.
+    """Intersections of rays with a surface, as arrays or tensors, in input coordinates and units.
 
     Attributes:
         mask: ``(...,)`` bool, whether the ray meets it.
@@ -58,19 +55,18 @@ class WorldHits(NamedTuple):
 
 
 class WorldField:
-    """A signed distance in the coordinates of a scan, a scene or a map: what a fit answers.
+    """A signed distance in the coordinates of a scan, a scene or a map: the result of a fit.
 
-    Fields live in the unit sphere; a `Similarity` leads there. Here both are one thing: points come and distances go in
-    input coordinates and units. Arrays in, arrays out, in float64; tensors in, tensors out, in their precision, on
-    their device, and with their graph. The shift is made in float64 before anything is rounded, so that map coordinates
-    keep their digits.
+    Points and distances are in input coordinates and units, the field in the unit sphere. Arrays in, arrays out, in
+    float64; tensors in, tensors out, in their precision, on their device, and with their graph. The shift is made in
+    float64, so that map coordinates keep their digits.
 
     Args:
         field: three-dimensional, in its own coordinates; or a function of points ``(..., 3)`` → ``(...,)``.
-        similarity: from input to the field's coordinates; the identity if there is none.
+        similarity: from input to the field's coordinates; the identity by default.
 
     Raises:
-        ValueError: the field is not three-dimensional; fix the time of one in space-time with `at_time`.
+        ValueError: the field is not three-dimensional; fix the time of one in space-time with `TimeSlice`.
 
     Example:
         >>> import numpy as np
@@ -81,9 +77,7 @@ class WorldField:
     """
 
     def __init__(self, field: FieldLike, similarity: Similarity | None = None) -> None:
-        field = as_field(field)
-        if field.in_dim != 3:
-            raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")
+        field = solid(field)
         self.field, self.similarity = field, similarity or Similarity.identity()
 
     def __repr__(self) -> str:
@@ -93,38 +87,27 @@ class WorldField:
     def distance(self, points: Points, *, level: int = -1) -> Points:
         """Signed distance ``(...,)`` of ``points`` ``(..., 3)``, negative inside, in input units.
 
-        Args:
-            points: in input coordinates.
-            level: of detail, 0 the coarsest, -1 the finest.
-
-        Raises:
-            ValueError: the last dimension is not 3, or there is no such level.
+        ``level`` is that of detail, 0 the coarsest, -1 the finest. ValueError for other shapes, or if there is no such
+        level.
         """
         return self._ask(points, lambda unit: (self.field.value(unit, level=level).double() * self.similarity.scale,))[
             0
         ]
 
     def normals(self, points: Points, *, level: int = -1) -> Points:
-        """Unit normals ``(..., 3)`` at ``points`` ``(..., 3)``: the direction in which the distance grows.
-
-        Raises:
-            ValueError: see `distance`.
-        """
+        """Unit normals ``(..., 3)`` at ``points`` ``(..., 3)``: the direction in which the distance grows."""
         return self._ask(points, lambda unit: (_unit(self.field.jet(unit, level=level).gradient),))[0]
 
     def closest(self, points: Points, *, level: int = -1, steps: int = 10, tolerance: float = 1e-5) -> Closest:
-        """The points of the surface that lie down the gradient of ``points`` ``(..., 3)``.
+        """The surface points down the gradient of ``points`` ``(..., 3)``.
 
-        Where the field is an exact distance that is the closest point. Tensors get no graph here.
+        They are the closest ones if the field is an exact distance. Tensors get no graph here.
 
         Args:
             points: in input coordinates.
             level: see `distance`.
             steps: at most so many evaluations for a point.
             tolerance: on the distance, in units of the field.
-
-        Raises:
-            ValueError: see `distance`.
         """
 
         def ask(unit: Tensor) -> tuple[Tensor, ...]:
@@ -174,17 +157,13 @@ class WorldField:
     def mesh(
         self, resolution: int = 256, *, level: int = -1, bounds: Bounds | None = None, normals: bool = True
     ) -> Mesh:
-        """A triangle mesh of the surface, in input coordinates.
+        """A triangle mesh of the surface, in input coordinates; errors are those of `extract_mesh`.
 
         Args:
             resolution: cells along the longest side of the box.
             level: see `distance`.
             bounds: lowest and highest corner of the box, in input coordinates; by default around the unit sphere.
             normals: whether vertices get normals.
-
-        Raises:
-            NoSurfaceError: there is no surface in the box.
-            ValueError: see `extract_mesh`.
         """
         box = DEFAULT_BOUNDS
         if bounds is not None:
@@ -203,7 +182,7 @@ class WorldField:
         azimuth: float = 30.0,
         elevation: float = 15.0,
     ) -> NDArray[np.uint8]:
-        """A picture of the surface, traced, with the light of ``mplicits render``.
+        """A picture of the surface ``(H, W, 3)``, display RGB, traced, with the light of ``mplicits render``.
 
         Args:
             path: a .png or .jpg file to write as well.
@@ -213,18 +192,13 @@ class WorldField:
             azimuth: degrees around that axis, from the front.
             elevation: degrees above the horizon.
 
-        Returns:
-            ``(H, W, 3)`` display RGB.
-
         Raises:
             InputError: there is no surface, or the file cannot be written.
         """
         return upward("render")(self, path, size=size, level=level, up=up, azimuth=azimuth, elevation=elevation)
 
     def show(self, *, up: str = "y", block: bool = True, browser: bool = True) -> Any:
-        """Open the surface in the browser, or in a notebook's cell.
-
-        In a script this returns when the page is closed, or at Ctrl-C.
+        """Open the surface in the browser, or in a notebook's cell; in a script, until the page is closed, or Ctrl-C.
 
         Args:
             up: the axis that points up, "y" or "z".
@@ -232,7 +206,7 @@ class WorldField:
             browser: whether to open one; otherwise only the address is printed.
 
         Returns:
-            The `PageServer`, or None once it is closed; in a notebook what shows the page there.
+            The `PageServer`, or None once it is closed; in a notebook the object that shows the page.
 
         Raises:
             NoSurfaceError: there is no surface.
@@ -241,17 +215,9 @@ class WorldField:
         return upward("show")(self, up=up, block=block, browser=browser)
 
     def union(self, *others: WorldField, smooth: float = 0.0) -> WorldField:
-        """This solid and others as one, wherever each was fitted.
+        """This solid and others, in the same input coordinates, as one; in a unit sphere around all (`in_one_frame`).
 
-        Args:
-            others: in the same input coordinates.
-            smooth: width of the blend, in input units; see `Union`.
-
-        Returns:
-            A field in a unit sphere around all of them; see `in_one_frame`.
-
-        Raises:
-            ValueError: ``smooth`` is negative.
+        ``smooth`` is the width of the blend in input units (`Union`); ValueError if it is negative.
 
         Example:
             >>> from mplicits.neural_fields import Similarity, Sphere, WorldField
@@ -263,35 +229,27 @@ class WorldField:
         return WorldField(Union(*fields, smooth=smooth / frame.scale), frame)
 
     def intersection(self, *others: WorldField, smooth: float = 0.0) -> WorldField:
-        """What is in this solid and in all others; see `union` and `Intersection`."""
+        """The points in this solid and in all others; see `union` and `Intersection`."""
         fields, frame = in_one_frame([self, *others])
         return WorldField(Intersection(*fields, smooth=smooth / frame.scale), frame)
 
     def difference(self, *others: WorldField, smooth: float = 0.0) -> WorldField:
-        """What is in this solid and in none of the others; see `union` and `Difference`."""
+        """The points in this solid and in none of the others; see `union` and `Difference`."""
         fields, frame = in_one_frame([self, *others])
         return WorldField(Difference(*fields, smooth=smooth / frame.scale), frame)
 
     def offset(self, by: float) -> WorldField:
-        """This solid grown by a length in input units, or shrunk by a negative one; see `Offset`.
-
-        Raises:
-            ValueError: ``by`` is not finite.
-        """
+        """This solid grown by a finite length in input units, or shrunk by a negative one; see `Offset`."""
         fields, frame = in_one_frame([self], margin=max(by, 0.0))
         return WorldField(Offset(*fields, by=by / frame.scale), frame)
 
     def shell(self, *, inside: float = 0.0, outside: float = 0.0) -> WorldField:
-        """A wall that reaches so far into the solid and out of it, in input units; see `Shell`.
-
-        Raises:
-            ValueError: one is negative or not finite, or the wall has no thickness.
-        """
+        """A wall of this depth inside and height outside the solid, in input units; errors and more at `Shell`."""
         fields, frame = in_one_frame([self], margin=max(outside, 0.0))
         return WorldField(Shell(*fields, inside=inside / frame.scale, outside=outside / frame.scale), frame)
 
     def _ask(self, points: Any, function: Callable[..., tuple[Tensor, ...]], *others: Any) -> tuple[Any, ...]:
-        """What ``function`` says at points in the field's coordinates, in the kind and shape of the points given.
+        """``function`` of the points in the field's coordinates, in the kind and shape of the points given.
 
         ``others`` are rows beside the points that need no change of coordinates, such as directions.
         """
@@ -327,28 +285,10 @@ class WorldField:
 
 
 def in_one_frame(shapes: Sequence[WorldField], *, margin: float = 0.0) -> tuple[list[Field], Similarity]:
-    """Fields of different unit spheres, brought into one that holds them all.
+    """Fields of different unit spheres in one that holds them all, and the similarity from input coordinates to theirs.
 
-    What was learned counts for nothing outside its own unit sphere (`Bounded`); a closed form is asked everywhere.
-
-    Args:
-        shapes: in the same input coordinates.
-        margin: room around them, in input units.
-
-    Returns:
-        The fields, and the similarity from input coordinates to theirs.
-
-    Raises:
-        ValueError: there are no shapes, or ``margin`` is negative or not finite.
-
-    Example:
-        >>> from mplicits.neural_fields import Similarity, Sphere, Union, WorldField
-        >>> from mplicits.neural_fields.shape import in_one_frame
-        >>> balls = [WorldField(Sphere(), Similarity((x, 0.0, 0.0), 1.0)) for x in (-1.0, 1.0)]
-        >>> fields, frame = in_one_frame(balls)
-        >>> frame
-        Similarity(center=(0.0, 0.0, 0.0), scale=2.0)
-        >>> both = WorldField(Union(*fields), frame)
+    What was learned is cut off at its own unit sphere (`Bounded`); a closed form holds everywhere. ``margin`` is room
+    around the shapes, in input units. ValueError if there are no shapes, or the margin is negative or not finite.
     """
     if not shapes or not 0 <= margin < np.inf:
         raise ValueError(f"{len(shapes)} shapes, margin={margin}: expected at least one, and a finite number ≥ 0")

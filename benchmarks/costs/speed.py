@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from mplicits.neural_fields import Field, InputError, Jet, MultiscaleSDF, Siren, load_field
-from mplicits.neural_fields.backend._parallel import one_thread, over_blocks, split_operations
+from mplicits.neural_fields.backend.devices import one_thread, over_blocks, split_operations
 from mplicits.neural_fields.meshing.extract import DEFAULT_BOUNDS, extract_mesh
 from mplicits.neural_fields.networks.multiscale import levels_of
 from mplicits.pipelines.training.folder import find_field

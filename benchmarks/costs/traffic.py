@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
-from mplicits.neural_fields.backend import _parallel
+from mplicits.neural_fields.backend import devices
 from mplicits.neural_fields.networks import siren
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -75,9 +75,9 @@ def _tensors(values: Any) -> Iterator[Tensor]:
 @contextmanager
 def _blocks_of_a_gpu() -> Iterator[None]:
     """Evaluate in blocks as large as on a GPU: the smaller blocks of a CPU would add launches."""
-    before = siren.BLOCK_FLOATS, _parallel.WANTED_BLOCKS
-    siren.BLOCK_FLOATS, _parallel.WANTED_BLOCKS = siren.GPU_BLOCK_FLOATS, 1
+    before = siren.BLOCK_FLOATS, devices.WANTED_BLOCKS
+    siren.BLOCK_FLOATS, devices.WANTED_BLOCKS = siren.GPU_BLOCK_FLOATS, 1
     try:
         yield
     finally:
-        siren.BLOCK_FLOATS, _parallel.WANTED_BLOCKS = before
+        siren.BLOCK_FLOATS, devices.WANTED_BLOCKS = before

@@ -19,7 +19,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from mplicits.neural_fields.backend._checks import at_least, positive
+from mplicits.neural_fields.backend.errors import at_least, positive
 from mplicits.neural_fields.fields.field import Field, Jet
 from torch import Tensor, nn
 

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 import torch
-from mplicits.neural_fields.backend._checks import at_least, positive
+from mplicits.neural_fields.backend.errors import at_least, positive
 from mplicits.neural_fields.fields.field import Field, Jet, OneLevelField
 from torch import Tensor, nn
 

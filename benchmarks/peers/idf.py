@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 
 import torch
-from mplicits.neural_fields.backend._checks import positive
+from mplicits.neural_fields.backend.errors import positive
 from mplicits.neural_fields.fields.field import Field, Jet
 from mplicits.neural_fields.networks.siren import Siren
 from torch import Tensor

@@ -1,27 +1,25 @@
-"""What the host should know of a device that works behind its back: when to look, and how to hand it something."""
+"""Where and how work runs: transfers to accelerators without waiting, blocks of rows on CPU threads, traced calls."""
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 
 import torch
 from torch import Tensor
 
-__all__ = ["Supply", "few_numbers", "handed", "is_supplied", "makes_wait", "precise", "uniform", "upload"]
-
 
 def makes_wait(device: torch.device) -> bool:
-    """Whether a look at a number of ``device`` keeps the host from giving it more to do: on any but the CPU."""
+    """Whether reading a number of ``device`` blocks the host until the device is done: on all but the CPU."""
     return device.type != "cpu"
 
 
 def upload(tensor: Tensor, device: torch.device | str) -> Tensor:
-    """A tensor of the host on ``device``, without waiting until the device has done what it was asked for before.
-
-    From pinned memory, which PyTorch keeps until the copy is done; a copy from other memory would wait.
-    """
+    """The tensor on ``device``; copied from pinned memory, so that the host does not wait."""
     device = torch.device(device)
     if device.type in ("cpu", "mps"):  # these share the host's memory
         return tensor.to(device)
@@ -29,14 +27,10 @@ def upload(tensor: Tensor, device: torch.device | str) -> Tensor:
 
 
 class Supply:
-    """What the host makes for a work of a device that is done again and again, with the same operations each time.
+    """Inputs from the host for work that a device repeats with the same operations, as a CUDA graph wants them.
 
-    The first time, inside `noting`, it goes to the device as it is asked for, and how it was made is noted down. From
-    then on, inside `supplied`, the work finds it in memory of the device that stays where it is, as a CUDA graph wants
-    it; `renew` makes all of it once more, in the same order, and sends it in one copy for each precision.
-
-    Args:
-        device: where the work is done.
+    The first run, inside `noting`, records how each input is made. Inside `supplied`, `handed` returns views of fixed
+    device memory, which `renew` fills again: in the same order, with one copy per dtype.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -49,7 +43,7 @@ class Supply:
 
     @contextmanager
     def noting(self) -> Iterator[None]:
-        """The work is done as if there were no supply; `handed` notes down. Once."""
+        """Record every `handed` call of the block; used once."""
         token = _supply.set(self)
         try:
             yield
@@ -59,7 +53,7 @@ class Supply:
 
     @contextmanager
     def supplied(self) -> Iterator[None]:
-        """`handed` gives what `renew` has put there, and makes nothing."""
+        """Inside, `handed` returns what `renew` has written, and makes nothing."""
         self._next = 0
         token = _supply.set(self)
         try:
@@ -69,14 +63,14 @@ class Supply:
             self._next = None
 
     def renew(self) -> None:
-        """Make all of it anew, for the next time."""
+        """Make all inputs again, for the next run."""
         made = [make() for make in self._makers]
         for dtype, store in self._stores.items():
             flat = torch.cat([one.reshape(-1) for one in made if one.dtype == dtype])
             store.copy_(upload(flat, self.device), non_blocking=True)
 
     def _lay_out(self) -> None:
-        """Memory for all that was noted down, and the place of each part in it."""
+        """Allocate memory for the recorded inputs, and views of it, one for each."""
         sizes: dict[torch.dtype, int] = {}
         starts = []
         for dtype, shape in self._shapes:
@@ -103,31 +97,178 @@ _supply: ContextVar[Supply | None] = ContextVar("supply", default=None)
 
 
 def handed(make: Callable[[], Tensor], device: torch.device) -> Tensor:
-    """What the host makes, on ``device``; anew each time, where a work is done again by a `Supply`.
-
-    Args:
-        make: draws random numbers, or tells what the host knows by now; its shape is the same each time.
-        device: of the work.
-    """
+    """``make()`` on ``device``; inside a `Supply`, made again for each run. Its shape must not change between calls."""
     supply = _supply.get()
     return upload(make(), device) if supply is None else supply.give(make)
 
 
 def uniform(shape: Sequence[int], generator: torch.Generator, device: torch.device) -> Tensor:
-    """Random numbers from 0 to 1 that the host draws, `handed` over."""
+    """Random numbers in [0, 1) of ``shape``, drawn on the host, `handed` to ``device``."""
     return handed(lambda: torch.rand(*shape, generator=generator), device)
 
 
 def is_supplied() -> bool:
-    """Whether this work will be done again by a `Supply`, so that numbers of the host must go through `handed`."""
+    """Whether a `Supply` repeats this work, so that inputs from the host must go through `handed`."""
     return _supply.get() is not None
 
 
 def few_numbers(numbers: Sequence[float], like: Tensor) -> Tensor:
-    """A vector of some numbers of the host, where and as ``like`` is: filled in there, which nobody waits for."""
+    """A vector of numbers on the device and in the dtype of ``like``, filled there without waiting."""
     return torch.stack([like.new_full((), number) for number in numbers])
 
 
 def precise(device: torch.device) -> torch.dtype:
-    """Float64 where the device has it: what the host computes with, for numbers that stay on the device."""
+    """Float64, or float32 on devices without it (MPS)."""
     return torch.float32 if device.type == "mps" else torch.float64
+
+
+def is_traced() -> bool:
+    """Whether plain operations are needed: under `torch.func.vmap`, or while `torch.compile` traces.
+
+    Inductor turns writes into parts of uninitialised buffers into wrong numbers.
+    """
+    return torch.compiler.is_compiling() or under_vmap()
+
+
+def under_vmap() -> bool:
+    """Whether this call is mapped over a batch, at any depth of `torch.func`'s transforms."""
+    if torch.compiler.is_compiling():
+        return False
+    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
+    if functorch.maybe_current_level() is None:
+        return False
+    vmap = functorch.TransformType.Vmap
+    return any(each.key() == vmap for each in functorch.get_interpreter_stack() or ())
+
+
+Step = Callable[[slice], None]
+
+LEAST_ROWS = 1024  # of a block: with fewer, calls from Python (one thread at a time) dominate
+WANTED_BLOCKS = 8  # that few rows are cut into, where blocks stay at LEAST_ROWS: enough for eight cores
+LEAST_BLOCKS = 4  # for threads; with fewer, waking them costs more than it saves
+
+
+_split = ContextVar("split", default=False)
+_pool: ThreadPoolExecutor | None = None
+_pool_lock = threading.Lock()
+
+
+def over_blocks(rows: int, size: int, prepare: Callable[[int], Step], *, like: Tensor) -> None:
+    """Call a step for each block of at most ``size`` of ``rows`` rows, on as many threads as PyTorch is set to use.
+
+    ``prepare(size)`` is called once per thread and returns its step, with buffers of its own. A step gets the slice of
+    its block. Threads meet once, at the end, and a block's result depends on nothing else: the bits are the same for
+    any number of threads. Threads are used for plain CPU tensors ``like``; others get the blocks in turn. The first
+    error is raised.
+    """
+    if like.device.type == "cpu":  # elsewhere more blocks are more launches
+        shorter = min(size, max(LEAST_ROWS, -(-rows // WANTED_BLOCKS)))
+        if -(-rows // shorter) >= LEAST_BLOCKS:
+            size = shorter
+    count = -(-rows // size)
+    threads = min(torch.get_num_threads(), count)
+    if threads < 2 or count < LEAST_BLOCKS or not _may_share(like):
+        step = prepare(min(size, rows))
+        for start in range(0, rows, size):
+            step(slice(start, min(start + size, rows)))
+        return
+    blocks, inference = _Blocks(rows, size), torch.is_inference_mode_enabled()
+
+    def helper() -> None:
+        torch.set_num_threads(1)
+        with torch.inference_mode(inference), torch.no_grad():
+            blocks.work(prepare)
+
+    with one_thread():
+        helpers = [_helpers().submit(helper) for _ in range(threads - 1)]
+        try:
+            blocks.work(prepare)
+        finally:
+            # Helpers that have not begun are cancelled, so this waits only for the blocks under way.
+            failures = [error for one in helpers if not one.cancel() and (error := one.exception()) is not None]
+    if failures:
+        raise failures[0]
+
+
+class _Blocks:
+    """Slices of the rows, each handed out once, to any thread."""
+
+    def __init__(self, rows: int, size: int) -> None:
+        self._starts = iter(range(0, rows, size))
+        self._rows, self._size = rows, size
+        self._lock = threading.Lock()
+
+    def __iter__(self) -> Iterator[slice]:
+        while True:
+            with self._lock:
+                start = next(self._starts, None)
+            if start is None:
+                return
+            yield slice(start, min(start + self._size, self._rows))
+
+    def work(self, prepare: Callable[[int], Step]) -> None:
+        """Process blocks until none is left; after an error no thread begins another."""
+        step: Step | None = None
+        try:
+            for block in self:
+                step = step or prepare(min(self._size, self._rows))
+                step(block)
+        except BaseException:
+            with self._lock:
+                self._starts = iter(())
+            raise
+
+
+def _may_share(like: Tensor) -> bool:
+    """Whether other threads may work on this tensor; modes that watch operations watch one thread only."""
+    return (
+        not _split.get()
+        and like.device.type == "cpu"
+        and type(like) in (Tensor, torch.nn.Parameter)
+        and not torch.compiler.is_compiling()
+        and not torch._C._len_torch_dispatch_stack()
+        and not torch._C._len_torch_function_stack()
+        and not torch._C._functorch.maybe_current_level()  # pyright: ignore[reportAttributeAccessIssue]
+    )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread inside each operation; afterwards as many as before."""
+    if torch.compiler.is_compiling():
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def split_operations() -> Iterator[None]:
+    """Blocks in turn, each operation split among all threads; for comparisons in benchmarks."""
+    token = _split.set(True)
+    try:
+        yield
+    finally:
+        _split.reset(token)
+
+
+def _helpers() -> ThreadPoolExecutor:
+    """The threads beside the caller's; made at first use, and again in a forked process."""
+    global _pool
+    with _pool_lock:
+        if _pool is None:
+            _pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1), thread_name_prefix="mplicits")
+        return _pool
+
+
+def _after_fork() -> None:
+    global _pool, _pool_lock
+    _pool, _pool_lock = None, threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

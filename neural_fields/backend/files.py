@@ -1,7 +1,6 @@
-"""Files that are written whole or not at all, and folders that are listed without what is being written.
+"""Files that are written whole or not at all.
 
-All that must survive a kill or a full disk goes through `write`, `sync`, `rename` and `remove`, so that tests can make
-each of these operations fail, or be the last one of a process (`tests/faults.py`).
+All that must survive a kill or a full disk goes through `write`, `sync`, `rename` and `remove` (see `tests/faults.py`).
 """
 
 from __future__ import annotations
@@ -19,25 +18,9 @@ import numpy as np
 
 from .errors import InputError
 
-__all__ = [
-    "check_place",
-    "damage",
-    "files_in",
-    "json_bytes",
-    "natural",
-    "partial_of",
-    "remove",
-    "rename",
-    "sync",
-    "whole_file",
-    "write",
-    "write_json",
-    "write_whole",
-]
-
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file, and wait until the disk has it."""
+    """Write a file, and wait until it is on the disk."""
     with path.open("wb") as file:
         file.write(content)
         file.flush()
@@ -45,7 +28,7 @@ def write(path: Path, content: bytes) -> None:
 
 
 def sync(folder: Path) -> None:
-    """Wait until the disk has the names in a folder; does nothing on Windows, where folders cannot be opened."""
+    """Wait until the names in a folder are on the disk; nothing on Windows, which cannot open folders."""
     if os.name == "nt":
         return
     descriptor = os.open(folder, os.O_RDONLY)
@@ -56,23 +39,17 @@ def sync(folder: Path) -> None:
 
 
 def rename(path: Path, target: Path) -> None:
-    """Give a file another name; a file of that name is replaced."""
+    """Rename a file; one of that name is replaced."""
     path.replace(target)
 
 
 def remove(path: Path) -> None:
-    """Remove a file, if it is there."""
+    """Remove a file, if it exists."""
     path.unlink(missing_ok=True)
 
 
 def check_place(path: str | Path) -> None:
-    """Whether a file or folder can come to be at ``path``, to be asked before any long work.
-
-    Folders that are missing on the way will be made by what writes there. Nothing is made now.
-
-    Raises:
-        InputError: what shall be a folder on the way is a file, or may not be written.
-    """
+    """Raise InputError unless a file or folder can be made at ``path``; makes nothing."""
     above = Path(path).absolute().parent
     while not (above.exists() or above.is_symlink()):  # the root is there at the latest
         above = above.parent
@@ -82,22 +59,14 @@ def check_place(path: str | Path) -> None:
         raise InputError(f"{path}: the folder {above} may not be written; choose another place")
 
 
-_LONG_WORD = re.compile(r"\S{200,}")  # of a file, quoted: what it says is clear from its beginning
+_LONG_WORD = re.compile(r"\S{200,}")  # quoted from a file; cut in messages
 
 
 @contextmanager
 def damage(path: str | Path, remedy: str) -> Iterator[None]:
-    """A block that reads a file which others made: whatever it trips over becomes one line, and nothing else is said.
+    """Turn any error of a block that reads the file ``path`` into one line, with ``remedy`` as the fix.
 
-    Numbers that overflow are those of the file; whoever reads it says of results what must be said. The
-    exception itself is kept as the cause.
-
-    Args:
-        path: the file, which the message names.
-        remedy: what to do about it.
-
-    Raises:
-        InputError: the block raised anything that is no `InputError`.
+    Warnings and floating-point errors are silenced. Raises InputError; the original error is its cause.
     """
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -118,19 +87,16 @@ def damage(path: str | Path, remedy: str) -> Iterator[None]:
 
 
 def partial_of(path: Path) -> Path:
-    """What ``path`` is called while it is written: hidden, with the number of the process and the same extension."""
+    """The name of ``path`` while it is written: hidden, with the process id and the same extension."""
     return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
 
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
-    """A temporary file beside ``path``, for the block to write, that takes its name when the block ends.
+    """A temporary file beside ``path`` for the block to write, renamed to ``path`` when the block ends.
 
-    It has the extension of ``path``, by which many writers choose the format. After an error or Ctrl-C it is gone, and
-    an older file is as it was. Folders that are missing on the way are made.
-
-    Raises:
-        InputError: the block, or the renaming, raised an OSError: the disk is full, a folder is a file.
+    It has the extension of ``path``. After an error or Ctrl-C it is removed, and an older file stays as it was. Missing
+    folders are made. Raises InputError for any OSError.
 
     Example:
         >>> with whole_file("mesh.ply") as partial:
@@ -151,11 +117,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
 
 
 def write_whole(path: str | Path, content: str | bytes) -> None:
-    """Write bytes, or text in UTF-8 with its line ends as they are, through `whole_file`.
-
-    Raises:
-        InputError: see `whole_file`.
-    """
+    """Write bytes, or text as UTF-8, through `whole_file`."""
     with whole_file(path) as partial:
         write(partial, content.encode() if isinstance(content, str) else content)
 
@@ -166,20 +128,16 @@ def json_bytes(data: Any) -> bytes:
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write data as `json_bytes` through `whole_file`.
-
-    Raises:
-        InputError: see `whole_file`.
-    """
+    """Write data as `json_bytes` through `whole_file`."""
     write_whole(path, json_bytes(data))
 
 
 def natural(name: str) -> tuple[list[str | int], str]:
-    """A key that sorts names with their numbers as numbers: ``2.png`` comes before ``10.png``."""
+    """A sort key that compares numbers in names as numbers: ``2.png`` before ``10.png``."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
 
 
 def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """What a folder holds with one of these extensions (lower case), in natural order of names; no hidden files."""
+    """Files of a folder with one of these lower-case extensions, in natural order; no hidden ones."""
     files = (file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.name[0] != ".")
     return sorted(files, key=lambda file: natural(file.name))

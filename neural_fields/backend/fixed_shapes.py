@@ -1,8 +1,6 @@
 """Evaluations whose shapes follow from those of the points alone, so that the host never waits for the device.
 
-The number of rows in a band is known only on the device. A CPU gathers exactly these rows; a GPU would have to finish
-all its work first. Inside `fixed_shapes` a band has room for a given number of rows instead. The first ones in it are
-found by prefix sums; places that are left over are computed and thrown away.
+A band has capacity for a given number of rows: prefix sums find the first of them, surplus places are discarded.
 """
 
 from __future__ import annotations
@@ -16,20 +14,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["FixedShapes", "Rows", "chosen", "current_shapes", "first_rows", "fixed_shapes", "one_evaluation"]
-
 
 class FixedShapes:
-    """How much room bands have, and who found none.
+    """Fixed buffer capacity per band, and a mask of rows that overflowed.
 
     Attributes:
-        capacity: rows for each residual level, coarse to fine; None, and levels beyond the last, have room for all.
-        wanted: ``(N,)`` bool, the points whose values anybody will read; None for all. Others get a coarse value.
-        demand: for each residual level that was evaluated, the most points that were in its band, 0-dimensional int64.
-        lost: ``(N,)`` bool of the last evaluation, the points that found no room in a band: they have the value of a
-            coarser level. None where there was room for all. Of a field of fields (`Union`, …), in a band of any part.
-        rooms: how many rows each choice by `chosen` has room for; those without a name here for all.
-        asked: by the same names, how many rows were to be chosen, 0-dimensional int64.
+        capacity: rows for each residual level, coarse to fine; None, and levels beyond the last: all rows.
+        wanted: ``(N,)`` bool, points whose values are used; None for all. Others get a coarse value.
+        demand: per residual level, the largest number of points in its band so far, 0-d int64.
+        lost: ``(N,)`` bool of the last evaluation: points that overflowed a band, and have a coarser level's value; or
+            None.
+        rooms: capacity of each choice by `chosen`; without a name here, all rows.
+        asked: by the same names, how many rows were to be chosen, 0-d int64.
     """
 
     def __init__(
@@ -45,13 +41,13 @@ class FixedShapes:
         self._under_way = False
 
     def begin(self) -> None:
-        """Forget who was lost: a new evaluation begins, unless it is part of another."""
+        """Reset ``lost`` at the start of an evaluation that is not part of another."""
         if not self._under_way:
             self.lost = None
 
     @contextmanager
     def whole(self) -> Iterator[None]:
-        """What is evaluated inside this is one evaluation."""
+        """All evaluations inside count as one."""
         self.begin()
         before, self._under_way = self._under_way, True
         try:
@@ -60,15 +56,10 @@ class FixedShapes:
             self._under_way = before
 
     def admit(self, index: int, inside: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Let points into the band of a residual level.
+        """Admit the points ``inside`` ``(N,)`` to the band of residual ``index``.
 
-        Args:
-            index: of the residual, from 0.
-            inside: ``(N,)`` bool, who lies in the band.
-
-        Returns:
-            ``(N,)`` bool, who found room; and their rows ``(C,)``, those left over being N; None if there is room for
-            all, so that every point may be evaluated where it is.
+        Returns the mask of those admitted, and their rows ``(C,)``, surplus ones being N; None for rows if capacity
+        suffices for all, so that every point may be evaluated in place.
         """
         count = inside.sum()
         if index < len(self.demand):
@@ -85,20 +76,14 @@ class FixedShapes:
 
 
 class Rows(NamedTuple):
-    """Some rows of tensors ``(N, …)``, and the way to them and back.
+    """Some rows of tensors ``(N, …)``."""
 
-    Attributes:
-        places: ``(K,)`` their numbers; places that are left over have N.
-        total: N.
-        full: whether none can be left over.
-    """
-
-    places: Tensor
-    total: int
-    full: bool
+    places: Tensor  # (K,) their numbers, N for surplus places
+    total: int  # N
+    full: bool  # whether no place is surplus
 
     def of(self, tensor: Tensor) -> Tensor:
-        """``(N, …)`` → ``(K, …)``; places that are left over get the last row, and whatever they find is lost."""
+        """``(N, …)`` → ``(K, …)``; surplus places get the last row."""
         return tensor[self.places] if self.full else tensor.index_select(0, self.places.clamp(max=self.total - 1))
 
     def back(self, found: Tensor) -> Tensor:
@@ -109,12 +94,12 @@ class Rows(NamedTuple):
 
     @property
     def used(self) -> Tensor:
-        """``(K,)`` bool, False for places that are left over."""
+        """``(K,)`` bool, False for surplus places."""
         return self.places < self.total
 
     @contextmanager
     def wanted(self) -> Iterator[None]:
-        """Inside this, fields let none of the places that are left over into a band."""
+        """Inside this, fields admit no surplus place to a band."""
         shapes = current_shapes()
         if shapes is None or self.full:
             yield
@@ -127,12 +112,7 @@ class Rows(NamedTuple):
 
 
 def chosen(name: str, mask: Tensor) -> Rows:
-    """The rows of ``mask`` ``(N,)`` that are True; with a given room inside `fixed_shapes`.
-
-    Args:
-        name: of the choice, for `FixedShapes.rooms`.
-        mask: bool, N ≥ 1.
-    """
+    """The rows of ``mask`` ``(N,)``, N ≥ 1, that are True; inside `fixed_shapes` with the capacity of ``name``."""
     shapes = current_shapes()
     if shapes is None:
         return Rows(mask.nonzero()[:, 0], len(mask), full=True)
@@ -150,19 +130,8 @@ def fixed_shapes(
 ) -> Iterator[FixedShapes]:
     """Inside this, a `MultiscaleSDF` never makes the host wait, and launches the same kernels for any points.
 
-    Without a ``capacity`` every level is evaluated at every point, and used where it lies in the band. Results are the
-    usual ones but for rounding. With capacities, check ``lost``. The arguments are those of `FixedShapes`.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import MultiscaleSDF
-        >>> from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
-        >>> sdf = MultiscaleSDF.from_widths([(16, 1), (16, 1)], omegas=[5, 10])
-        >>> x = torch.zeros(4, 3)
-        >>> with fixed_shapes():
-        ...     value = sdf.value(x)
-        >>> bool((value - sdf.value(x)).abs().max() < 1e-6)
-        True
+    Without a ``capacity`` every level is evaluated at every point, and used in its band. Results are equal but for
+    rounding. With capacities, check ``lost``. The arguments are those of `FixedShapes`.
     """
     shapes = FixedShapes(capacity, rooms=rooms)
     token = _shapes.set(shapes)
@@ -173,21 +142,18 @@ def fixed_shapes(
 
 
 def current_shapes() -> FixedShapes | None:
-    """Those of the innermost `fixed_shapes`; None outside of any."""
+    """Those of the innermost `fixed_shapes`, or None."""
     return _shapes.get()
 
 
 def one_evaluation() -> AbstractContextManager[None]:
-    """Inside this, fields that are asked one after the other, at the same points, count as one."""
+    """Inside this, evaluations of several fields at the same points count as one."""
     shapes = current_shapes()
     return nullcontext() if shapes is None else shapes.whole()
 
 
 def first_rows(mask: Tensor, count: int) -> Tensor:
-    """The first ``count`` rows of ``mask`` ``(N,)`` that are True, in order; N where there are fewer → ``(count,)``.
-
-    What `nonzero` gives, in a shape that is known before: each row goes to where the sum of those before it says.
-    """
+    """The first ``count`` True rows of ``mask`` ``(N,)``, in order, padded with N: `nonzero` in a fixed shape."""
     place = torch.where(mask, mask.cumsum(0) - 1, count).clamp(max=count)
     rows = torch.full((count + 1,), len(mask), dtype=torch.int64, device=mask.device)
     return rows.scatter_(0, place, torch.arange(len(mask), device=mask.device))[:count]

@@ -1,12 +1,12 @@
 """Constructive solid geometry: union, intersection, difference, sharp or blended; offsets, shells, placing, bounding.
 
-Each is a `Field` of other fields. Level j of a combination is that of its parts, a part with fewer levels staying at
-its finest; a band is so wide that outside it no part changes the sign:
+Level j of a combination is that of its parts, a part with fewer levels staying at its finest. A band is so wide that
+outside it no part changes the sign:
 
     h_{j+1} = join(f_{j+1}, g_{j+1}, …) where every coarser |h_i| < δ_i, and h_j elsewhere.
 
-With parts of slope at most L the slope of each combination is at most L. The result is a bound on the distance: |h| is
-at most the distance to its surface, and less where the nearest point of a part was cut away. The surface is exact.
+With parts of slope at most L each combination has slope at most L. |h| is a bound on the distance to its surface, which
+is exact, and less where the nearest point of a part was cut away.
 """
 
 from __future__ import annotations
@@ -18,18 +18,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..backend._checks import at_least, positive
 from ..backend.devices import few_numbers
+from ..backend.errors import at_least, positive
 from ..backend.fixed_shapes import current_shapes, one_evaluation
-from .field import Field, Jet
-from .function import FieldLike, as_field
+from .field import Field, FieldLike, Jet, as_field, solid
 from .similarity import Similarity
-
-__all__ = ["Bounded", "Combined", "Difference", "Intersection", "Offset", "Placed", "Shell", "Union"]
 
 
 class Combined(Field):
-    """A field of fields; a subclass says where they are asked, how values join, and how jets do."""
+    """A field of fields; a subclass defines the points of the parts, and how values and jets join."""
 
     def __init__(self, *parts: FieldLike) -> None:
         super().__init__()
@@ -52,7 +49,7 @@ class Combined(Field):
 
     @property
     def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands: the widest of the parts at each level, and what the combination adds to it."""
+        """Half-widths of the bands: the widest of the parts at each level, plus what the combination adds."""
         bands = [field.deltas for field in self.fields]
         padded = [torch.nn.functional.pad(band, (0, self.num_levels - 1 - len(band))) for band in bands]
         return self._band(torch.stack(padded).amax(dim=0))
@@ -66,7 +63,7 @@ class Combined(Field):
         return self._walk(x, self.resolve_level(level))[0]
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        """See `Field.jet`; every point is asked for the jet of the level that it has come to."""
+        """See `Field.jet`; each point has the jet of the finest level whose bands it is in."""
         level = self.resolve_level(level)
         if level == 0 or not self.check_points(x).numel():
             return self._jet(self.check_points(x), level)
@@ -85,7 +82,7 @@ class Combined(Field):
         return Jet(*(part.reshape(*x.shape[:-1], *part.shape[1:]) for part in joined))
 
     def _jet_of_all(self, x: Tensor, level: int) -> Jet:
-        """The same where shapes are fixed: the jets of all levels at every point, and from each its own."""
+        """The same inside `fixed_shapes`: jets of all levels at every point, then a choice."""
         with one_evaluation():
             with torch.no_grad():
                 reached = self._walk(x, level)[1]
@@ -102,7 +99,7 @@ class Combined(Field):
         return jet
 
     def _walk(self, x: Tensor, level: int) -> tuple[list[Tensor], Tensor]:
-        """The values of all levels up to ``level``, and which of them each point has come to, int64 ``(...,)``."""
+        """The values of all levels up to ``level``, and the level that each point reaches, int64 ``(...,)``."""
         home = self._home(self.check_points(x))
         with one_evaluation():
             columns = [field.level_values(home, level=min(level, field.num_levels - 1)) for field in self.fields]
@@ -122,12 +119,12 @@ class Combined(Field):
         return self._join_jets(x, [field.jet(home, level=min(level, field.num_levels - 1)) for field in self.fields])
 
     def _home(self, x: Tensor) -> Tensor:
-        """Where the parts are asked."""
+        """The points at which the parts are evaluated."""
         return x
 
     @abstractmethod
     def _band(self, delta: Tensor) -> Tensor:
-        """|h_j| ≥ this must mean that h_{j+1} has the sign of h_j, if the parts stay where |f_j| ≥ ``delta``."""
+        """|h_j| ≥ this implies that h_{j+1} has the sign of h_j, if the parts keep theirs where |f_j| ≥ ``delta``."""
 
     @abstractmethod
     def _join(self, x: Tensor, values: list[Tensor]) -> Tensor: ...
@@ -150,13 +147,13 @@ class _Pointwise(Combined):
         value, weights = self._weigh([jet.value for jet in jets])
         gradient = torch.zeros_like(x)
         for weight, jet in zip(weights, jets, strict=True):
-            # A part without a say may have no gradient there, and NaN times 0 is NaN.
+            # A part of weight 0 may have no gradient there, and NaN times 0 is NaN.
             gradient = gradient + torch.where(weight[..., None] == 0, 0.0, weight[..., None] * jet.gradient)
         return Jet(value, gradient, jets[0].features if len(jets) == 1 else x.new_empty((*x.shape[:-1], 0)))
 
 
 class _Boolean(_Pointwise):
-    """±min(±f, ±g, …), the minimum blended where two are nearer to each other than ``smooth``."""
+    """±min(±f, ±g, …); the minimum is blended where two values differ by less than ``smooth``."""
 
     defined_by = ("smooth",)
 
@@ -174,7 +171,7 @@ class _Boolean(_Pointwise):
         return delta + (len(self.parts) - 1) * self.smooth / 4
 
     def _blend(self, values: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
-        """The joined value, and for each part but the first the derivative of their blend by what came before."""
+        """The joined value, and for each part but the first the derivative of the blend by what came before."""
         sign, signs = self._signs()
         lowest, *others = (own * value for own, value in zip(signs, values, strict=True))
         shares = []
@@ -196,9 +193,9 @@ class _Boolean(_Pointwise):
 
 
 def _smooth_minimum(a: Tensor, b: Tensor, width: float) -> tuple[Tensor, Tensor]:
-    """min(a, b) where they differ by more than ``width``, a parabola between; and its derivative s by a.
+    """min(a, b) where they differ by more than ``width``, a parabola between; and its derivative s by a (1 − s by b).
 
-    s a + (1 − s) b − width s (1 − s) with s = 1/2 + (b − a) / (2 width) in [0, 1]; 1 − s is the derivative by b.
+    s a + (1 − s) b − width s (1 − s) with s = 1/2 + (b − a) / (2 width) in [0, 1].
     """
     if width == 0:
         return torch.where(b < a, b, a), (b >= a).to(a.dtype)
@@ -207,12 +204,11 @@ def _smooth_minimum(a: Tensor, b: Tensor, width: float) -> tuple[Tensor, Tensor]
 
 
 class Union(_Boolean):
-    """What is in one of the parts: ``min_i f_i(x)``; exact outside of parts with exact distances, a bound inside.
+    """The points in any of the parts: ``min_i f_i(x)``; exact outside of parts with exact distances, a bound inside.
 
-    With ``smooth`` k, two values that differ by less than k are blended by a parabola, the polynomial minimum of the
-    literature: the union grows by at most k/4, only there, and stays as smooth as its parts. Where two planes meet at a
-    right angle, that makes a fillet whose radius of curvature is k/√2 at its middle. More than two parts are blended
-    one after the other.
+    With ``smooth`` k, values that differ by less than k are blended by the polynomial minimum: the union grows there by
+    at most k/4, and stays as smooth as its parts. Between two planes at a right angle the fillet has radius k/√2 at its
+    middle. More than two parts are blended in turn.
 
     Args:
         parts: fields, or functions of points; shared, not copied.
@@ -234,10 +230,9 @@ class Union(_Boolean):
 
 
 class Intersection(_Boolean):
-    """What is in all of the parts: ``max_i f_i(x)``; exact inside of parts with exact distances, a bound outside.
+    """The points in all of the parts: ``max_i f_i(x)``; exact inside of parts with exact distances, a bound outside.
 
-    With ``smooth`` k it shrinks by at most k/4, where two values differ by less than k. Arguments and errors are those
-    of `Union`.
+    With ``smooth`` k it shrinks by at most k/4. Arguments and errors are those of `Union`.
     """
 
     def _signs(self) -> tuple[int, Sequence[int]]:
@@ -245,7 +240,7 @@ class Intersection(_Boolean):
 
 
 class Difference(_Boolean):
-    """What is in the first part and in none of the others: ``max(f_0, −f_1, −f_2, …)``, a bound on the distance.
+    """The points in the first part and in none of the others: ``max(f_0, −f_1, −f_2, …)``, a bound on the distance.
 
     With ``smooth`` k it shrinks by at most k/4 for each part taken away. Arguments and errors are those of `Union`.
 
@@ -264,16 +259,12 @@ class Difference(_Boolean):
 class Offset(_Pointwise):
     """The solid grown by a distance, or shrunk by a negative one: ``f(x) − by``.
 
-    As exact as f is at that distance from its surface. Corners of a bound (see `Union`) stay sharp where those of a
-    distance would be round. A `MultiscaleSDF` is its coarsest level wherever |f_0| ≥ δ_0, so an offset beyond δ_0 is
-    one of that level; ``mplicits offset`` measures from the surface of the finest instead.
+    As exact as f is at that distance from its surface. A `MultiscaleSDF` is its coarsest level where |f_0| ≥ δ_0, so an
+    offset beyond δ_0 is one of that level; ``mplicits offset`` measures from the surface of the finest instead.
 
     Args:
         part: the solid, a field or a function of points.
-        by: how far, in the field's units.
-
-    Raises:
-        ValueError: ``by`` is not finite.
+        by: distance, in the field's units; ValueError if it is not finite.
 
     Example:
         >>> import torch
@@ -298,16 +289,15 @@ class Offset(_Pointwise):
 
 
 class Shell(_Pointwise):
-    """A wall along the surface, ``−inside < f(x) < outside``.
+    """A wall along the surface, ``−inside < f(x) < outside``: ``|f(x) − m| − (outside + inside) / 2``.
 
-    With m = (outside − inside) / 2 that is ``|f(x) − m| − (outside + inside) / 2``. Where f is an exact distance,
-    the wall is ``inside + outside`` thick; for what is further than δ_0 from the surface of a `MultiscaleSDF`, see
-    `Offset`.
+    m = (outside − inside) / 2. Where f is an exact distance, the wall is ``inside + outside`` thick; for what is
+    further than δ_0 from the surface of a `MultiscaleSDF`, see `Offset`.
 
     Args:
         part: the solid, a field or a function of points.
-        inside: how far the wall reaches into the solid, in the field's units.
-        outside: how far it reaches out of it.
+        inside: depth of the wall inside the solid, in the field's units.
+        outside: its height outside.
 
     Raises:
         ValueError: one is negative or not finite, or the wall has no thickness.
@@ -338,28 +328,13 @@ class Shell(_Pointwise):
 class Placed(Combined):
     """A field moved and scaled: ``scale · f((x − center) / scale)``, a distance if f is one.
 
-    Brings fields that were fitted in different unit spheres into one; see `in_one_frame`.
-
-    Args:
-        part: three-dimensional.
-        similarity: from the coordinates that this field is asked in to those of the part.
-
-    Raises:
-        ValueError: the field is not three-dimensional.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Similarity, Sphere
-        >>> from mplicits.neural_fields.fields.csg import Placed
-        >>> Placed(Sphere(radius=0.5), Similarity((1.0, 0.0, 0.0), 2.0))(torch.tensor([[3.0, 0.0, 0.0]]))
-        tensor([1.])
+    The ``similarity`` maps from the coordinates of this field to those of the three-dimensional ``part``.
     """
 
     defined_by = ("similarity",)
 
     def __init__(self, part: FieldLike, similarity: Similarity) -> None:
-        super().__init__(part)
-        _check_space(self)
+        super().__init__(solid(part))
         self.similarity = similarity
 
     def _home(self, x: Tensor) -> Tensor:
@@ -376,36 +351,17 @@ class Placed(Combined):
 
 
 class Bounded(Combined):
-    """A field that is known in a ball around 0 only, continued beyond it: the solid f < 0 within the ball.
+    """A three-dimensional field that is known in a ball around 0 only, continued beyond as the solid in the ball.
 
-    A network says anything where it was not trained. Outside the ball this asks it at the nearest point p = r x / |x|
-    of the ball: the solid lies within the ball, which is convex, so with u = max(f(p), 0) and v = |x| − r
-
-        √(u² + v²) ≤ the distance of x,
-
-    whose slope is at most that of f, or 1. Inside it is max(f(x), |x| − r), so that a surface which leaves the ball is
-    closed at its edge.
-
-    Args:
-        part: three-dimensional.
-        radius: r.
-
-    Raises:
-        ValueError: the field is not three-dimensional, or ``radius`` is not positive.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Plane
-        >>> from mplicits.neural_fields.fields.csg import Bounded
-        >>> Bounded(Plane(), radius=1.0)(torch.tensor([[0.0, 0.0, -0.5], [0.0, 0.0, -3.0], [0.0, 0.0, 3.0]]))
-        tensor([-0.5000,  2.0000,  2.2361])
+    Outside the ball f is evaluated at the nearest point p = r x / |x| of the ball. With u = max(f(p), 0) and v = |x| −
+    r, √(u² + v²) is at most the distance of x, with the slope of f or 1. Inside it is max(f(x), |x| − r), which closes
+    a surface that leaves the ball.
     """
 
     defined_by = ("radius",)
 
     def __init__(self, part: FieldLike, *, radius: float = 1.05) -> None:
-        super().__init__(part)
-        _check_space(self)
+        super().__init__(solid(part))
         positive(radius=radius)
         self.radius = float(radius)
 
@@ -421,7 +377,7 @@ class Bounded(Combined):
         return torch.where(beyond > 0, self._outside(beyond, values[0]), within)
 
     def _outside(self, beyond: Tensor, value: Tensor) -> Tensor:
-        """√(u² + v²) outside the ball; 1 inside, where a root of 0 would have no derivative."""
+        """√(u² + v²) outside the ball; 1 inside, where the root of 0 would have no derivative."""
         return torch.where(beyond > 0, value.clamp(min=0).square() + beyond.square(), 1.0).sqrt()
 
     def _join_jets(self, x: Tensor, jets: list[Jet]) -> Jet:
@@ -437,8 +393,3 @@ class Bounded(Combined):
         outside = slope / self._outside(beyond, value)[..., None]
         joined = torch.where((beyond > 0)[..., None], outside, within)
         return Jet(self._join(x, [value]), joined, features)
-
-
-def _check_space(field: Field) -> None:
-    if field.in_dim != 3:
-        raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")

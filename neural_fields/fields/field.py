@@ -1,17 +1,15 @@
-"""``Field`` with its ``Jet`` and ``SecondJet``: the one interface between geometry and everything that uses it."""
+"""``Field`` with its ``Jet`` and ``SecondJet``: the one interface of geometry; and fields of any function of points."""
 
 from __future__ import annotations
 
 import operator
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from numbers import Real
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
-
-__all__ = ["Field", "Jet", "OneLevelField", "SecondJet", "plain"]
 
 
 class Jet(NamedTuple):
@@ -19,8 +17,7 @@ class Jet(NamedTuple):
 
     Attributes:
         value: ``(...,)`` signed distance, negative inside; ``(..., 3)`` for a colour field.
-        gradient: ``(..., d)``, or ``(..., 3, d)`` for a colour field. Not normalised: a gradient
-            is not a normal.
+        gradient: ``(..., d)``, or ``(..., 3, d)`` for a colour field; not normalised.
         features: ``(..., F)`` extra outputs; F may be 0.
     """
 
@@ -30,14 +27,7 @@ class Jet(NamedTuple):
 
 
 class SecondJet(NamedTuple):
-    """A `Jet` with second derivatives (a field's 2-jet); scalar fields only.
-
-    Attributes:
-        value: ``(...,)``.
-        gradient: ``(..., d)``.
-        features: ``(..., F)``.
-        hessian: ``(..., k, k)`` second derivatives of the value by the first k coordinates.
-    """
+    """A `Jet` of a scalar field with ``hessian`` ``(..., k, k)``, second derivatives by the first k coordinates."""
 
     value: Tensor
     gradient: Tensor
@@ -48,17 +38,15 @@ class SecondJet(NamedTuple):
 class Field(nn.Module, ABC):
     """A function of space, known by its value and its analytic gradient, at one or more levels of detail.
 
-    Levels count from 0, coarse to fine (level i is the paper's f_{i+1}); ``level=-1`` is the finest.
-    Each level but the last has a band, ``|f_i(x)| < deltas[i]``, outside which the next level adds nothing.
-
-    A subclass gives `value` and `jet`, and has then one level in three dimensions unless it says otherwise. Called as a
-    module, a field answers with its value.
+    Levels count from 0, coarse to fine (level i is the paper's f_{i+1}); ``level=-1`` is the finest. Each level but the
+    last has a band, ``|f_i(x)| < deltas[i]``, outside which the next level adds nothing. A subclass implements `value`
+    and `jet`. Called as a module, a field returns its value.
 
     Attributes:
         in_dim: dimension d of the domain, 3, or 4 for (x, y, z, t).
         num_levels: how many levels of detail the field has.
-        deltas: ``(num_levels - 1,)`` half-widths of the bands, in the field's own units; infinite where there is no
-            band, because the next level is an alternative and not a refinement.
+        deltas: ``(num_levels - 1,)`` half-widths of the bands, in field units; infinite where the next level is an
+            alternative and not a refinement.
         defined_by: names of the attributes that decide the function beside its tensors; see `definition`.
 
     Example:
@@ -96,21 +84,15 @@ class Field(nn.Module, ABC):
 
     @abstractmethod
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        """Evaluate value and gradient together at ``x`` ``(..., d)``.
+        """Evaluate value and gradient at ``x`` ``(..., d)``; errors as in `value`.
 
         The gradient is analytic and itself differentiable with respect to parameters and ``x``.
-
-        Raises:
-            ValueError: the last dimension of ``x`` is not ``in_dim``, or there is no such level.
         """
 
     def value_features(self, x: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
-        """Value ``(...,)`` and features ``(..., F)`` at ``x`` ``(..., d)``, where nobody asks for the gradient.
+        """Value ``(...,)`` and features ``(..., F)`` at ``x`` ``(..., d)``, without the gradient; errors as in `value`.
 
         This default takes them from a jet; networks have them for the price of a value.
-
-        Raises:
-            ValueError: as in `value`.
         """
         jet = self.jet(x, level=level)
         return jet.value, jet.features
@@ -120,7 +102,7 @@ class Field(nn.Module, ABC):
         return self.value(x, level=level)
 
     def definition(self) -> Mapping[str, Any]:
-        """What decides the function beside its tensors, by name; shown by ``repr`` and kept beside state dicts."""
+        """What decides the function beside its tensors, by name; part of ``repr`` and of state dicts."""
         return {name: getattr(self, name) for name in self.defined_by}
 
     def extra_repr(self) -> str:
@@ -131,15 +113,15 @@ class Field(nn.Module, ABC):
         return ", ".join(f"{name}={value!r}" for name, value in shown.items())
 
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
-        """Evaluate value, gradient and Hessian together at ``x`` ``(..., d)``.
+        """Evaluate value, gradient and Hessian at ``x`` ``(..., d)``.
 
-        Differentiable with respect to parameters and ``x``. This default differentiates the analytic gradient
-        once with autograd; SIRENs have their own closed form.
+        Differentiable with respect to parameters and ``x``. This default differentiates the analytic gradient once with
+        autograd; SIRENs have their own closed form.
 
         Args:
-            x: the points.
+            x: ``(..., d)``.
             level: as in `value`.
-            dims: second derivatives by the first so many coordinates, by default all; 3 leaves time out.
+            dims: second derivatives by the first ``dims`` coordinates, by default all; 3 leaves time out.
 
         Raises:
             ValueError: as in `value`, or ``dims`` is not in 1 … d.
@@ -163,35 +145,29 @@ class Field(nn.Module, ABC):
 
     @property
     def like(self) -> Tensor:
-        """A tensor of this field's precision, where the field is: ``points.to(field.like)`` can be asked for."""
+        """A tensor on the field's device and in its precision: ``points.to(field.like)``."""
         return next(self.parameters(), self.deltas)
 
     @property
     def same_rows(self) -> bool:
         """Whether every field inside this one is evaluated at the same rows, in the same order.
 
-        Tracing on a GPU is faster then. The default is true for a field whose modules include no other `Field`.
-        A field that wraps others and evaluates them at every point may return true too.
+        Tracing on a GPU is faster then. By default true for a field without other fields inside. A wrapper that
+        evaluates others at every point may return true.
         """
         return sum(isinstance(module, Field) for module in self.modules()) == 1
 
     def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
-        """The values of all levels up to ``level`` at ``x`` ``(..., d)``, coarse to fine, ``(...,)`` each.
+        """Values ``(...,)`` of all levels up to ``level`` at ``x`` ``(..., d)``, coarse to fine.
 
-        This default asks for one level after the other; a field whose levels build on each other evaluates each once.
-
-        Raises:
-            ValueError: as in `value`.
+        This default evaluates level after level; a field whose levels build on each other evaluates each once.
         """
         return [self.value(x, level=each) for each in range(self.resolve_level(level) + 1)]
 
     def in_band(self, x: Tensor, *, level: int) -> Tensor:
-        """Whether ``level`` may be evaluated at ``x`` ``(..., d)`` → bool ``(...,)``.
+        """Whether ``level`` may be evaluated at ``x`` ``(..., d)`` → bool ``(...,)``; errors as in `value`.
 
-        True where every coarser level says ``|f_i(x)| < deltas[i]``; level 0 is allowed everywhere.
-
-        Raises:
-            ValueError: the last dimension of ``x`` is not ``in_dim``, or there is no such level.
+        True where every coarser level has ``|f_i(x)| < deltas[i]``, and everywhere for level 0.
         """
         inside = torch.ones(self.check_points(x).shape[:-1], dtype=torch.bool, device=x.device)
         level = self.resolve_level(level)
@@ -205,7 +181,7 @@ class Field(nn.Module, ABC):
 
         Raises:
             ValueError: there is no such level.
-            TypeError: it is no whole number.
+            TypeError: it is not a whole number.
         """
         if not isinstance(level, int):
             try:
@@ -217,22 +193,13 @@ class Field(nn.Module, ABC):
         return level % self.num_levels
 
     def resolve_dims(self, dims: int | None) -> int:
-        """How many coordinates second derivatives are taken by; all for None.
-
-        Raises:
-            ValueError: the field has fewer, or ``dims`` is not positive.
-        """
+        """The number of coordinates of second derivatives, all for None; ValueError outside 1 … d."""
         if dims is not None and not 1 <= dims <= self.in_dim:
             raise ValueError(f"dims={dims}: expected 1 to {self.in_dim}")
         return self.in_dim if dims is None else dims
 
     def check_points(self, x: Tensor) -> Tensor:
-        """Return ``x`` if its shape is ``(..., in_dim)``.
-
-        Raises:
-            ValueError: it is not.
-            TypeError: it is no tensor.
-        """
+        """Return ``x`` if its shape is ``(..., in_dim)``; else raise ValueError, or TypeError for no tensor."""
         if not isinstance(x, Tensor):
             raise TypeError(f"x is a {type(x).__name__}; expected a tensor (..., {self.in_dim}): torch.as_tensor(x)")
         if x.ndim == 0 or x.shape[-1] != self.in_dim:
@@ -240,10 +207,7 @@ class Field(nn.Module, ABC):
         return x
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
-        """Note the definition in the metadata that `torch.nn.Module.state_dict` keeps beside the tensors.
-
-        In plain types, which ``torch.load(weights_only=True)`` reads.
-        """
+        """Keep the definition in the state dict's metadata, in types that ``weights_only=True`` loads."""
         super()._save_to_state_dict(destination, prefix, keep_vars)
         destination._metadata[prefix[:-1]]["definition"] = plain(self.definition())
 
@@ -257,10 +221,7 @@ class Field(nn.Module, ABC):
         unexpected_keys: Any,
         error_msgs: Any,
     ) -> None:
-        """Refuse tensors that would make another function here than the one that they were taken from.
-
-        Where the metadata has been lost on the way (a plain dict, a safetensors file), there is nothing to compare.
-        """
+        """Refuse tensors of another function than this one; a dict without metadata is not checked."""
         here = plain(self.definition())
         there = local_metadata.get("definition", here)
         error_msgs += [
@@ -275,7 +236,7 @@ class Field(nn.Module, ABC):
 
 
 def plain(value: Any) -> Any:
-    """Numbers, words and what holds them as Python's own, whoever made them; all else as it prints."""
+    """Numbers, words and their containers as Python's own types; anything else as its ``repr``."""
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, Real):
@@ -286,12 +247,115 @@ def plain(value: Any) -> Any:
 
 
 class OneLevelField(Field):
-    """A field with one level of detail, and so without bands.
-
-    Args:
-        in_dim: dimension of the domain.
-    """
+    """A field with one level of detail and without bands, of dimension ``in_dim``."""
 
     def __init__(self, in_dim: int = 3) -> None:
         super().__init__()
         self.in_dim = in_dim
+
+
+class Wrapper(Field):
+    """A field evaluated through another one, ``field``, whose levels and bands it has; a subclass defines the jet."""
+
+    field: Field
+
+    @property
+    def same_rows(self) -> bool:
+        """Whether it holds for the field inside."""
+        return self.field.same_rows
+
+    @property
+    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Half-widths of the bands of the field inside."""
+        return self.field.deltas
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
+        return self.field.value(self._home(x), level=level)
+
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`."""
+        return self.field.level_values(self._home(x), level=level)
+
+    def _home(self, x: Tensor) -> Tensor:
+        """The points at which the field inside is evaluated."""
+        return x
+
+
+# Accepted where a field is expected: a field, or any function of points ``(..., 3)`` → ``(...,)``.
+FieldLike = Field | Callable[[Tensor], Tensor]
+
+
+class FunctionField(Field):
+    """``f(x) = function(x)``; the gradient comes from autograd.
+
+    Args:
+        function: points ``(..., d)`` → signed distances ``(...,)``, negative inside, in torch operations. A module is
+            registered, so that its parameters are this field's.
+        in_dim: dimension d of the domain.
+
+    Raises:
+        TypeError: ``function`` cannot be called.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import FunctionField
+        >>> ball = FunctionField(lambda x: x.norm(dim=-1) - 0.5)
+        >>> ball.jet(torch.tensor([1.0, 0.0, 0.0])).gradient
+        tensor([1., 0., 0.])
+    """
+
+    def __init__(self, function: Callable[[Tensor], Tensor], *, in_dim: int = 3) -> None:
+        super().__init__()
+        if not callable(function):
+            raise TypeError(f"function: got a {type(function).__name__}; expected one of points (..., {in_dim})")
+        self.function, self.in_dim = function, in_dim
+
+    def extra_repr(self) -> str:
+        """The function and the dimension of its domain."""
+        return f"function={getattr(self.function, '__qualname__', type(self.function).__name__)}, in_dim={self.in_dim}"
+
+    @property
+    def same_rows(self) -> bool:
+        """False: the function may evaluate other fields at any points."""
+        return False
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`; ValueError if the function does not return one number for each point."""
+        self.resolve_level(level)
+        found = self.function(self.check_points(x))
+        if not isinstance(found, Tensor) or found.shape != x.shape[:-1]:
+            got = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+            raise ValueError(f"function: returned {got} for points {tuple(x.shape)}; expected {tuple(x.shape[:-1])}")
+        return found
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`; one pass forward and one back."""
+        recorded = torch.is_grad_enabled() and (x.requires_grad or any(p.requires_grad for p in self.parameters()))
+        with torch.inference_mode(False), torch.enable_grad():
+            y = self.check_points(x)
+            y = y if y.requires_grad and recorded else y.detach().clone().requires_grad_()
+            value = self.value(y, level=level)
+            gradient = torch.zeros_like(y)
+            if value.requires_grad:  # a constant depends on nothing
+                (gradient,) = torch.autograd.grad(value.sum(), y, create_graph=recorded, materialize_grads=True)
+        if not recorded:
+            value, gradient = value.detach(), gradient.detach()
+        return Jet(value, gradient, x.new_empty((*x.shape[:-1], 0)))
+
+
+def as_field(field: FieldLike) -> Field:
+    """The field itself, or a `FunctionField` of a callable; TypeError for anything else."""
+    if isinstance(field, Field):
+        return field
+    if not callable(field):
+        raise TypeError(f"field: got a {type(field).__name__}; expected a Field, or a function of points (..., 3)")
+    return FunctionField(field)
+
+
+def solid(field: FieldLike) -> Field:
+    """`as_field`; ValueError for a field that is not three-dimensional."""
+    field = as_field(field)
+    if field.in_dim != 3:
+        raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")
+    return field

@@ -1,4 +1,4 @@
-"""The terms of the paper's Eqs. 1 and 4 and of its texture loss, per point: callers choose the mean and the weights."""
+"""Loss terms of the paper's Eqs. 1 and 4 and of its texture loss, per point; callers take the mean and weights."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import math
 
 import torch
 from torch import Tensor
-
-__all__ = ["color_loss", "data_loss", "eikonal_loss", "normal_loss", "pseudo_huber", "tangential_loss"]
 
 
 def data_loss(value: Tensor, target: Tensor | float = 0.0) -> Tensor:
@@ -18,31 +16,23 @@ def data_loss(value: Tensor, target: Tensor | float = 0.0) -> Tensor:
 def normal_loss(gradient: Tensor, normal: Tensor, *, eps: float = 1e-8) -> Tensor:
     """``1 − ⟨∇f, N⟩ / |∇f|`` with unit normals N. ``(..., d)`` twice → ``(...,)`` in [0, 2].
 
-    The paper writes ``1 − ⟨∇f, N⟩``, which rewards ever longer gradients until the eikonal term stops it;
-    the cosine asks for the direction only and leaves the length to the eikonal term.
+    The paper has no division by |∇f|, so its term also rewards longer gradients; the cosine leaves length to
+    `eikonal_loss`.
     """
     return 1 - torch.nn.functional.cosine_similarity(gradient, normal, dim=-1, eps=eps)
 
 
 def pseudo_huber(loss: Tensor, scale: float) -> Tensor:
-    """``s (√(1 + 2 c / s) − 1)`` of losses c that grow with a square: c itself where c ≪ s, ``√(2 s c)`` where c ≫ s.
+    """``s (√(1 + 2 c / s) − 1)`` of losses c ``(...,)`` ≥ 0: c where c ≪ s or s = ∞, ``√(2 s c)`` where c ≫ s.
 
-    Of ``c = 1 − cos a`` it is a²/2 for small angles a and √s a for large ones, so that a few large ones, which nothing
-    can be done about, do not outweigh many small ones (Charbonnier et al., "Two deterministic half-quadratic
+    Few large losses then do not outweigh many small ones (Charbonnier et al., "Two deterministic half-quadratic
     regularization algorithms for computed imaging", ICIP 1994).
-
-    Args:
-        loss: ``(...,)`` losses, 0 or more.
-        scale: s, positive; infinity leaves the losses as they are.
     """
     return loss if scale == math.inf else scale * ((1 + 2 * loss / scale).sqrt() - 1)
 
 
 def eikonal_loss(gradient: Tensor, *, eps: float = 1e-12) -> Tensor:
-    """``(|∇f| − 1)²``. ``(..., d)`` → ``(...,)``.
-
-    ``eps`` keeps the derivative of the length finite where the gradient vanishes.
-    """
+    """``(|∇f| − 1)²``. ``(..., d)`` → ``(...,)``. ``eps`` keeps its derivative finite where the gradient vanishes."""
     return ((gradient.square().sum(dim=-1) + eps).sqrt() - 1) ** 2
 
 
@@ -52,13 +42,10 @@ def color_loss(color: Tensor, target: Tensor) -> Tensor:
 
 
 def tangential_loss(derivative: Tensor, delta: Tensor | float) -> Tensor:
-    """``δ² |∇g ∇f|² / 3``, the second term of 𝒯: the colour shall not change along the normals, only across them.
+    """``δ² |∇g ∇f|² / 3``, the second term of 𝒯: colour is constant along normals.
 
-    The paper has no δ there; with it the term is a squared difference of colours, that between the middle of
-    the band and its rim, so one weight serves bands of any width and shapes of any scale.
-
-    Args:
-        derivative: ``(..., 3)``, ∇g along ∇f.
-        delta: half-width of the band, in units of the field.
+    ``derivative`` ``(..., 3)`` is ∇g along ∇f. The paper has no δ (half-width of the band, field units). With it the
+    term is a squared colour difference between the middle of the band and its rim, so one weight serves bands of any
+    width.
     """
     return delta**2 * derivative.square().mean(dim=-1)

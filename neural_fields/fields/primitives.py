@@ -8,35 +8,34 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ..backend._checks import positive
 from ..backend.devices import few_numbers
+from ..backend.errors import positive
 from .field import Jet, OneLevelField
 
-__all__ = ["Box", "Capsule", "Plane", "Sphere", "Torus"]
-
-
-# A value, and the gradient for who asks for it.
+# A value, and a function that returns the gradient.
 Evaluated = tuple[Tensor, Callable[[], Tensor]]
 
 
 class ClosedForm(OneLevelField):
-    """A closed-form field; a subclass gives value and gradient at points."""
+    """A closed-form field; a subclass returns value and gradient at points."""
 
     @abstractmethod
     def _evaluate(self, x: Tensor) -> Evaluated: ...
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
         self.resolve_level(level)
         return self._evaluate(self.check_points(x))[0]
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`."""
         self.resolve_level(level)
         value, gradient = self._evaluate(self.check_points(x))
         return Jet(value, gradient(), x.new_empty((*x.shape[:-1], 0)))
 
 
 def _direction(v: Tensor, length: Tensor) -> Tensor:
-    """``v`` over its length; zero vectors get direction zero instead of NaN."""
+    """``v`` over its length; 0 for zero vectors."""
     safe = torch.where(length > 0, length, torch.ones_like(length))
     return v / safe[..., None]
 

@@ -1,4 +1,4 @@
-"""The similarity between the user's coordinates and the unit sphere in which fields live."""
+"""The unit sphere in which fields live: the similarity from the user's coordinates, and chords of balls around 0."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-__all__ = ["Similarity"]
+from torch import Tensor
 
 Float64 = NDArray[np.float64]
 
@@ -16,8 +15,8 @@ Float64 = NDArray[np.float64]
 class Similarity:
     """``x_unit = (x_input - center) / scale``, kept in float64.
 
-    Map coordinates (UTM metres, say) have seven digits before the point; float32 has seven in all.
-    The shift is therefore always made in float64, before anything is rounded.
+    Map coordinates (UTM metres, say) have seven digits before the point, float32 seven in all: the shift is made in
+    float64.
 
     Attributes:
         center: three numbers, in input units.
@@ -41,7 +40,7 @@ class Similarity:
         """Centre ``points`` ``(N, 3)`` on their bounding box and scale them into the unit sphere.
 
         Raises:
-            ValueError: there are no points, or all of them coincide.
+            ValueError: all points coincide.
         """
         center = (points.min(axis=0) + points.max(axis=0)) / 2
         radius = float(np.sqrt(((points - center) ** 2).sum(axis=1).max()))
@@ -56,3 +55,14 @@ class Similarity:
     def to_input(self, points: NDArray[np.floating]) -> Float64:
         """Map ``(..., 3)`` unit-sphere coordinates back to input coordinates, in float64."""
         return np.asarray(points, np.float64) * self.scale + np.asarray(self.center)
+
+
+def ball_chord(origins: Tensor, directions: Tensor, radius: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Depth at which lines ``(R, 3)`` are nearest to 0, and half the length of their chord of a ball, 0 if they miss.
+
+    Directions are of unit length; ``radius`` of the ball around 0 is a number or ``(R,)``.
+    """
+    middle = -(origins * directions).sum(dim=-1)
+    # From the nearest point, and not from |o|² − middle², which cancels for far cameras.
+    squared = radius**2 - (origins + middle[:, None] * directions).square().sum(dim=-1)
+    return middle, squared.clamp(min=0).sqrt()

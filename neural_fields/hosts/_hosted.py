@@ -1,44 +1,39 @@
-"""What the shells for hosts have in common: scale, learning rates, bands that narrow, meshes in the host's units."""
+"""Shared by the adapters: scale, rates, narrowing bands, meshes in the host's units, and a memo of two results."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+import weakref
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import positive
-from ..fields.field import Jet
-from ..fields.function import FieldLike, as_field
+from ..backend.errors import positive
+from ..fields.field import FieldLike, Jet, as_field
 from ..fields.similarity import Similarity
-from ..meshing._lattice import Bounds
+from ..meshing._cells import Bounds
 from ..meshing.mesh import Mesh
 from ..shape import WorldField
 from .learning_rates import HOST_RATE, Pace, parameter_groups, rescale_parameters
-
-__all__ = ["Box", "Hosted", "as_bounds", "joined", "mark"]
 
 # The corners of a box, lowest and highest: a tensor or an array ``(2, 3)``, or two triples.
 Box = Tensor | Sequence[Sequence[float]]
 
 
 class Hosted(nn.Module):
-    """A field f in a host's units: f(s x) / s, whose gradient is ∇f(s x).
+    """A field f in a host's units: f(s x) / s, whose gradient is ∇f(s x). ValueError if a number is not positive.
 
     Args:
         field: signed distance, negative inside.
-        scale: s; None for 1, or with ``bounds`` for what brings their farthest corner onto the field's unit sphere.
-        bounds: lowest and highest corner of what the host samples and meshes, in its own units ``(2, 3)``; None for
-            the box from −half to half on each axis.
-        half: of that box, in the host's units.
+        scale: s; by default 1, or with ``bounds`` what brings their farthest corner onto the field's unit sphere.
+        bounds: lowest and highest corner of what the host samples and meshes, in its units ``(2, 3)``.
+        half: half-edge of the box, in the host's units, where there are no ``bounds``.
         learning_rate: see `rescale_parameters`; None leaves the parameters in their own units.
         pace: share of the rates that suit the field; see `Pace`.
-
-    Raises:
-        ValueError: a number is not positive, or the bounds are none.
     """
 
     def __init__(
@@ -78,29 +73,28 @@ class Hosted(nn.Module):
 
         Raises:
             NoSurfaceError: there is no surface in the box.
-            ValueError: see `extract_mesh`.
         """
         box = self.bounds if bounds is None else as_bounds(bounds)
         return self.world.mesh(resolution, level=level, bounds=box, normals=normals)
 
     def parameter_groups(self, lr: float = HOST_RATE) -> list[dict[str, Any]]:
-        """Groups for the host's optimiser, with a rate for each layer of the field; see `rates.parameter_groups`."""
+        """Groups for the host's optimiser, with a rate for each layer; see `learning_rates.parameter_groups`."""
         return parameter_groups(self.field, lr, pace=self.pace)
 
     @torch.no_grad()
     def follow(self, inv_s: Tensor | float, *, band: float = 4.0, least: float = 0.02, most: float = 0.3) -> None:
-        """Let the bands be as wide as the surface is unsure; to be called after each step of the optimiser.
+        """Narrow the bands with the uncertainty of the surface; to be called after each step of the optimiser.
 
-        Every band gets the half-width ``band`` · s / inv_s, held between ``least`` and ``most``, s being the scale.
+        Every band gets the half-width ``band`` · s / inv_s, clamped to [``least``, ``most``], s being the scale.
 
         Args:
             inv_s: inverse standard deviation of NeuS's density, in the host's units; of several numbers the mean.
             band: half-width in standard deviations.
-            least: half-width that a band keeps, in the field's units.
-            most: half-width that it does not exceed.
+            least: smallest half-width, in the field's units.
+            most: largest half-width.
 
         Raises:
-            ValueError: the numbers do not grow from above 0 to ``most``.
+            ValueError: not 0 < least <= most.
         """
         if not 0 < least <= most:
             raise ValueError(f"least={least}, most={most}: expected 0 < least <= most")
@@ -125,7 +119,7 @@ class Hosted(nn.Module):
             return Jet(value / self.scale, gradient, features)
 
     def _second_jet(self, x: Tensor) -> tuple[Jet, Tensor]:
-        """The same, and the Laplacian ``(...,)``."""
+        """The jet, and the Laplacian ``(...,)``."""
         with _full_precision(x):
             value, gradient, features, hessian = self.field.second_jet(x * self.scale)
         laplacian = self.scale * hessian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
@@ -133,11 +127,7 @@ class Hosted(nn.Module):
 
 
 def as_bounds(box: Box) -> Bounds:
-    """Two corners as plain numbers.
-
-    Raises:
-        ValueError: it is no ``(2, 3)``, or the second corner is not above the first.
-    """
+    """Two corners as plain numbers; ValueError unless ``(2, 3)`` with the second above the first."""
     corners = torch.as_tensor(box).detach().double().cpu()
     if corners.shape != (2, 3) or not bool((corners[0] < corners[1]).all()):
         raise ValueError(f"bounds={corners.tolist()}: expected the lowest and the highest corner of a box, (2, 3)")
@@ -163,15 +153,15 @@ def mark(x: Tensor, gradient: Tensor) -> Tensor:
 
 
 def _full_precision(x: Tensor) -> torch.autocast:
-    """Hosts train in half precision, in which a distance near the surface has no digits left."""
+    """Autocast off: in half precision a distance near the surface has no digits left."""
     return torch.autocast(x.device.type, enabled=False)
 
 
 @contextmanager
 def _reaching(x: Tensor) -> Iterator[Tensor]:
-    """``x`` for an evaluation whose graph reaches it, with its own flag as it was afterwards.
+    """``x`` for an evaluation whose graph reaches it, with its own flag restored afterwards.
 
-    Hosts evaluate first and mark the points as requiring gradients later, inside ``gradient``.
+    Hosts evaluate first, and mark the points as requiring gradients later, inside ``gradient``.
     """
     if not torch.is_grad_enabled() or x.requires_grad:
         yield x
@@ -183,3 +173,103 @@ def _reaching(x: Tensor) -> Iterator[Tensor]:
             yield x
         finally:
             x.requires_grad_(False)
+
+
+Half = Literal["value", "gradient"]
+Evaluate = Callable[[], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Waiting:
+    """The half of a pair (value, gradient) that was not requested yet, with all that it depends on."""
+
+    half: Half
+    result: Tensor
+    points: weakref.ref[Tensor]
+    handed: weakref.ref[Tensor]
+    module: nn.Module
+    tensors: tuple[Tensor, ...]
+    state: tuple[object, ...]
+
+    def fits(self, half: Half, points: Tensor, module: nn.Module, tensors: Sequence[Tensor]) -> bool:
+        """Whether this is the requested half, and nothing has changed since it was evaluated."""
+        return (
+            self.half == half
+            and self.points() is points
+            and self.module is module
+            and len(self.tensors) == len(tensors)
+            and all(old is new for old, new in zip(self.tensors, tensors, strict=True))
+            and self.state == _state(points, module, tensors)
+        )
+
+
+class PointMemo:
+    """Keeps one half of the last pair (value, gradient) until it is requested, at the very same points.
+
+    Renderers like NeuS's call for the values and then, by another method, for the gradient at the same tensor. The
+    first call evaluates both and returns its half; the second gets the other, once. The kept half is dropped
+
+    - when it is returned, or anything else is requested;
+    - when the points or the returned half die, so no graph lives longer than the caller's own tensors;
+    - when a gradient flows back through the returned half: autograd may have freed the graph of both.
+
+    It is used only for the same tensor object at the same version, with the same tensors of the module at the same
+    versions, and in the same grad mode. Writes through ``.data`` or NumPy between the two calls are not noticed.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: _Waiting | None = None
+
+    def __reduce__(self) -> tuple[type[PointMemo], tuple[()]]:
+        """Copies and pickles start empty: weak references cannot be copied."""
+        return PointMemo, ()
+
+    def ask(self, half: Half, points: Tensor, module: nn.Module, evaluate: Evaluate) -> Tensor:
+        """One half of ``evaluate()``, which returns (value, gradient) of ``module`` at ``points``."""
+        waiting, self._waiting = self._waiting, None
+        tensors = (*module.parameters(), *module.buffers())
+        # Inference tensors have no version; nothing that depends on one is remembered.
+        countable = not any(tensor.is_inference() for tensor in (points, *tensors))
+        if countable and waiting is not None and waiting.fits(half, points, module, tensors):
+            return waiting.result
+        value, gradient = evaluate()
+        handed, kept = (value, gradient) if half == "value" else (gradient, value)
+        if countable:
+            forget = _forgetter(weakref.ref(self))
+            self._waiting = _Waiting(
+                "gradient" if half == "value" else "value",
+                kept,
+                weakref.ref(points, forget),
+                weakref.ref(handed, forget),
+                module,
+                tensors,
+                _state(points, module, tensors),
+            )
+            if handed.requires_grad:
+                kept_entry = weakref.ref(self._waiting)
+                handed.register_hook(lambda _: self._forget(kept_entry()))
+        return handed
+
+    def _forget(self, waiting: _Waiting | None) -> None:
+        if self._waiting is waiting:
+            self._waiting = None
+
+
+def _forgetter(memo: weakref.ref[PointMemo]) -> Callable[[object], None]:
+    """Callback for the death of one of the memo's tensors."""
+
+    def forget(dead: object) -> None:
+        owner = memo()
+        waiting = None if owner is None else owner._waiting
+        if owner is not None and waiting is not None and (dead is waiting.points or dead is waiting.handed):
+            owner._forget(waiting)
+
+    return forget
+
+
+def _state(points: Tensor, module: nn.Module, tensors: Sequence[Tensor]) -> tuple[object, ...]:
+    """What a result depends on beside the identity of the points, the module and its tensors."""
+    # Assigning to `.data` replaces the memory and leaves the version as it was.
+    places = tuple((tensor._version, tensor.data_ptr(), tensor.dtype) for tensor in (points, *tensors))
+    trained = tuple(tensor.requires_grad for tensor in tensors)
+    return (torch.is_grad_enabled(), torch.is_inference_mode_enabled(), module.training, trained, places)

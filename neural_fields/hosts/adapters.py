@@ -1,7 +1,7 @@
-"""Fields in the shapes that other people's renderers call: NeuS, instant-nsr-pl, nerfstudio and sdfstudio.
+"""Fields with the interfaces of other renderers: NeuS, instant-nsr-pl, nerfstudio and sdfstudio.
 
-Each holds a `Field` f and evaluates it in the host's units: with ``scale`` s, f(s x) / s is again a distance and its
-gradient is ∇f(s x). None of the hosts is imported. How to change each host is in docs/drop-in.md.
+Each evaluates a `Field` f in the host's units: f(s x) / s is again a distance. No host is imported; see
+docs/drop-in.md.
 """
 
 from __future__ import annotations
@@ -11,33 +11,30 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import positive
-from ..fields.function import FieldLike
+from ..backend.errors import positive
+from ..fields.field import FieldLike
 from ..volume.weights import neus_alpha
-from ._hosted import Box, Hosted, joined, mark
-from ._point_memo import PointMemo
+from ._hosted import Box, Hosted, PointMemo, joined, mark
 from .learning_rates import HOST_RATE, Pace
-
-__all__ = ["Deviation", "InstantNSRGeometry", "NerfstudioField", "NeuSGeometry"]
 
 
 class NeuSGeometry(Hosted):
     """NeuS's ``SDFNetwork`` (Wang et al. 2021, ``models/fields.py``) around any field.
 
-    NeuS's renderer calls ``forward`` and then ``gradient`` on the same tensor of points. Both come from one jet: the
-    second call is served from what the first one evaluated (see `PointMemo`).
+    NeuS's renderer calls ``forward`` and then ``gradient`` on the same tensor of points; both come from one jet
+    (`PointMemo`).
 
     Args:
         field: signed distance, negative inside; with F features for a colour network that takes F.
-        scale: NeuS's own argument: points are multiplied by it, distances divided by it. 1 by default, or with
-            ``bounds`` what brings their farthest corner onto the field's unit sphere.
+        scale: NeuS's argument: points are multiplied by it, distances divided. By default 1, or with ``bounds`` what
+            brings their farthest corner onto the field's unit sphere.
         bounds: box of the mesh, ``(2, 3)``; from -1.01 to 1.01 by default, as in NeuS.
-        learning_rate: at which NeuS trains all its networks alike; the parameters of the field are then kept in units
-            in which this rate suits them (`rescale_parameters`). None leaves them alone.
+        learning_rate: NeuS's one rate for all networks; the parameters of the field are then kept in units in which it
+            suits them (`rescale_parameters`). None leaves them alone.
         pace: share of the rates that suit the field, one for all levels or one for each; see `Pace`.
 
     Raises:
-        ValueError: a number is not positive, or the bounds are none.
+        ValueError: a number is not positive, or the bounds are not a box.
 
     Example:
         >>> import torch
@@ -67,7 +64,7 @@ class NeuSGeometry(Hosted):
         return self._memo.ask("value", x, self.field, lambda: self._evaluate(x))
 
     def sdf_hidden_appearance(self, x: Tensor) -> Tensor:
-        """The same as ``forward``, under the other name that NeuS gives it."""
+        """``forward`` under NeuS's other name."""
         return self(x)
 
     def sdf(self, x: Tensor) -> Tensor:
@@ -90,9 +87,9 @@ class InstantNSRGeometry(Hosted):
     Args:
         field: signed distance in the unit sphere, negative inside, with F = ``feature_dim`` − 1 features.
         radius: the host's ``radius``: points reach from −radius to radius on each axis.
-        scale: points are multiplied by it, distances divided by it; 1 / radius by default, which leaves the corners
-            of the host's cube outside the field's unit sphere; 1 / (√3 radius) takes them in.
-        resolution: cells along each axis of the mesh that ``isosurface`` extracts.
+        scale: points are multiplied by it, distances divided; 1 / radius by default, which leaves the corners of the
+            host's cube outside the field's unit sphere; 1 / (√3 radius) takes them in.
+        resolution: cells along each axis of the mesh of ``isosurface``.
         learning_rate: of the host's group ``geometry``; see `NeuSGeometry`.
         pace: see `NeuSGeometry`.
 
@@ -132,20 +129,17 @@ class InstantNSRGeometry(Hosted):
         camera_indices: object = None,
         ray_indices: object = None,
     ) -> Tensor | list[Tensor]:
-        """What the flags ask for, in this order; a list, or the tensor itself if it is alone.
+        """``sdf`` ``(...,)`` and the outputs of the flags, in their order: a list, or the tensor itself if it is alone.
+
+        A graph is recorded while training, as in the host, and only where gradients are enabled.
 
         Args:
             points: ``(..., 3)`` in the host's units.
-            with_grad: the gradient too, ``(..., 3)``.
-            with_feature: the feature too, ``(..., 1 + F)``; its channel 0 is the distance.
-            with_laplace: the Laplacian too, ``(...,)``, from exact second derivatives; the host has finite differences.
+            with_grad: add the gradient ``(..., 3)``.
+            with_feature: add the feature ``(..., 1 + F)``, whose channel 0 is the distance.
+            with_laplace: add the Laplacian ``(...,)``, from exact second derivatives; the host has finite differences.
             camera_indices: unused; the host passes it for its appearance embedding.
             ray_indices: unused, likewise.
-
-        Returns:
-            ``sdf`` ``(...,)``, alone or first in the list. Value and gradient come from one jet; without the gradient
-            a value is all it costs. A graph is recorded while training, as the host does, and only where gradients
-            are enabled.
         """
         with torch.set_grad_enabled(self.training and torch.is_grad_enabled()):
             if not (with_grad or with_feature or with_laplace):
@@ -174,26 +168,22 @@ class InstantNSRGeometry(Hosted):
         return {"v_pos": vertices, "t_pos_idx": torch.as_tensor(mesh.faces, dtype=torch.int64)}
 
     def update_step(self, epoch: int, global_step: int) -> None:
-        """Called by the host before every step, without what the bands depend on; see ``follow``."""
+        """Called by the host before every step; does nothing, see ``follow``."""
 
     def regularizations(self, out: object) -> dict[str, Tensor]:
-        """Extra losses that the host adds: none."""
+        """Extra losses for the host: none."""
         return {}
 
 
 class Deviation(nn.Module):
-    """The one number that says how sharp the surface is: s = exp(10 v), NeuS's inverse standard deviation.
-
-    Args:
-        initial: v at the start; 0.3, that is s = 20, in NeuS.
-    """
+    """The sharpness of the surface as one parameter v: s = exp(10 v), NeuS's inverse standard deviation."""
 
     def __init__(self, initial: float = 0.3) -> None:
         super().__init__()
         self.variance = nn.Parameter(torch.full((1,), float(initial)))
 
     def get_variance(self) -> Tensor:
-        """s, ``(1,)``, kept between 1e-6 and 1e6 as the hosts do."""
+        """s, ``(1,)``, clamped to [1e-6, 1e6] as in the hosts."""
         return (10 * self.variance).exp().clamp(1e-6, 1e6)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -207,17 +197,17 @@ class NerfstudioField(Hosted):
     Args:
         field: signed distance, negative inside.
         color: called as ``color(x, direction, jet)`` with ``(..., 3)``, ``(..., 3)`` and the field's `Jet` there, in
-            the host's units; gives RGB ``(..., 3)``. `ViewColor` is one.
+            the host's units; returns RGB ``(..., 3)``. `ViewColor` is one.
         heads: the host's ``FieldHeadNames``, whose members are the keys of the outputs.
-        scale: points are multiplied by it, distances divided by it. 1 by default, or with ``bounds`` what brings their
+        scale: points are multiplied by it, distances divided. By default 1, or with ``bounds`` what brings their
             farthest corner onto the field's unit sphere.
         bounds: the host's ``scene_box.aabb`` ``(2, 3)``, box of the mesh too; from -1 to 1 by default.
-        deviation: initial value of the deviation network, the host's ``beta_init``.
-        learning_rate: of the host's group ``fields``; see `NeuSGeometry`. It is the geometry alone that changes units.
+        deviation: initial v of the deviation network, the host's ``beta_init``; 0.3, that is s = 20, in NeuS.
+        learning_rate: of the host's group ``fields``; see `NeuSGeometry`. Only the geometry changes units.
         pace: see `NeuSGeometry`.
 
     Raises:
-        ValueError: a number is not positive, or the bounds are none.
+        ValueError: a number is not positive, or the bounds are not a box.
     """
 
     def __init__(
@@ -239,7 +229,7 @@ class NerfstudioField(Hosted):
         self._memo = PointMemo()
 
     def set_cos_anneal_ratio(self, anneal: float) -> None:
-        """How true the slope in the opacity is: 0 at the start of training, 1 at the end of the annealing."""
+        """Set ``cos_anneal`` of `neus_optical_depth`: 0 at the start of training, 1 after annealing."""
         self.cos_anneal_ratio = float(anneal)
 
     def forward_geonetwork(self, inputs: Tensor) -> Tensor:
@@ -257,12 +247,9 @@ class NerfstudioField(Hosted):
         return self._value(ray_samples.frustums.get_start_positions())[..., None]
 
     def get_alpha(self, ray_samples: Any, sdf: Tensor | None = None, gradients: Tensor | None = None) -> Tensor:
-        """Opacity of the samples ``(R, S)`` → ``(R, S, 1)``.
+        """Opacity of the host's samples ``(R, S)`` → ``(R, S, 1)``.
 
-        Args:
-            ray_samples: the host's samples, with ``frustums`` and ``deltas`` ``(R, S, 1)``.
-            sdf: ``(R, S, 1)`` if known.
-            gradients: ``(R, S, 3)`` if known; where one of the two is missing, both come from one jet.
+        Without ``sdf`` ``(R, S, 1)`` or ``gradients`` ``(R, S, 3)`` both come from one jet.
         """
         if sdf is None or gradients is None:
             jet = self._jet(ray_samples.frustums.get_start_positions())
@@ -278,13 +265,7 @@ class NerfstudioField(Hosted):
     def get_outputs(
         self, ray_samples: Any, density_embedding: object = None, return_alphas: bool = False
     ) -> dict[Any, Tensor]:
-        """Colour, distance, normal and gradient of the samples, and their opacity, under the host's names.
-
-        Args:
-            ray_samples: the host's samples ``(R, S)``.
-            density_embedding: unused; the host's signature has it.
-            return_alphas: whether the opacity is among the outputs.
-        """
+        """Colour, distance, normal, gradient and, if asked, opacity of the samples ``(R, S)``, by the host's names."""
         frustums = ray_samples.frustums
         points = frustums.get_start_positions()
         jet = self._jet(points)
@@ -306,7 +287,7 @@ class NerfstudioField(Hosted):
         return self.get_outputs(ray_samples, return_alphas=return_alphas)
 
     def frontal_colors(self, x: Tensor) -> Tensor:
-        """Colours ``(..., 3)`` of points of the surface ``(..., 3)``, each seen against its normal."""
+        """Colours ``(..., 3)`` of surface points ``(..., 3)``, each seen against its normal."""
         jet = self._jet(x)
         return self.color(x, -nn.functional.normalize(jet.gradient, dim=-1), jet)
 
@@ -320,7 +301,7 @@ class NerfstudioField(Hosted):
         return [*super().parameter_groups(lr), {"params": others, "lr": lr}]
 
     def _normal_head(self) -> Any:
-        """What the host calls normals: NORMALS in nerfstudio, NORMAL in sdfstudio."""
+        """The host's key of normals: NORMALS in nerfstudio, NORMAL in sdfstudio."""
         return self.heads.NORMALS if hasattr(self.heads, "NORMALS") else self.heads.NORMAL
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:

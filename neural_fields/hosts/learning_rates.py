@@ -1,10 +1,9 @@
 """Learning rates for SIRENs in trainers that were made for softplus networks.
 
-In a layer z = ω₀ (W h + b) the weights are about ω₀ times as small as in a softplus layer that does as much, but Adam
-moves every weight by the learning rate. At one rate for both, a SIREN takes steps about ω₀ times as long. At NeuS's
-5e-4 its surface breaks while the colours are learnt. `parameter_groups` has a rate for each layer. For trainers that
-set one rate for all groups, as NeuS's does, `rescale_parameters` keeps the parameters in units in which one rate fits
-all.
+In a layer z = ω₀ (W h + b) weights are about ω₀ times smaller than in a softplus layer of the same effect, but Adam
+moves every weight by the learning rate. At one rate for both, a SIREN takes steps about ω₀ times as long; at NeuS's
+5e-4 its surface breaks while colours are learnt. `parameter_groups` has a rate for each layer. For trainers with one
+rate, as NeuS's, `rescale_parameters` keeps the parameters in units in which one rate fits all.
 """
 
 from __future__ import annotations
@@ -13,35 +12,26 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from torch import nn
-
-from ..backend._checks import positive
+from ..backend.errors import positive
 from ..fields.field import Field
 from ..networks.multiscale import MultiscaleSDF
 from ..networks.siren import Siren
 
-__all__ = ["HOST_RATE", "Pace", "parameter_groups", "rescale_parameters"]
-
-# Shares of the rates below at which levels learn, the coarsest first; the last is for all that are finer, and one
-# number for all. Where colours do not need the geometry's own features, half of the rates leaves fewer waves.
+# Factors on the rates below, for each level from the coarsest; the last is for all finer levels, one number for all.
 Pace = float | Sequence[float]
 
-# Adam's rate for the softplus networks of NeuS, sdfstudio and nerfstudio, beside which the two below were found.
-HOST_RATE = 5e-4
-SINE_RATE = 3e-3  # of sine layers, over ω₀
-OUTPUT_RATE = 1e-4  # of their outputs, which ω₀ is no part of
+HOST_RATE = 5e-4  # of Adam for the softplus networks of NeuS, sdfstudio and nerfstudio
+SINE_RATE = 3e-3  # of sine layers, divided by ω₀; found beside HOST_RATE
+OUTPUT_RATE = 1e-4  # of outputs; found beside HOST_RATE
 
 
 def parameter_groups(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -> list[dict[str, Any]]:
-    """The parameters of a field as groups for an optimiser, each with the rate that suits it.
+    """The parameters of a field as groups for an optimiser: dicts with ``params`` and ``lr``.
 
     Args:
         field: SIRENs anywhere in it get rates of their own; all else gets ``lr``.
-        lr: at which the host trains its own geometry; all rates are in proportion to it.
+        lr: the host's rate of its own geometry; all rates are in proportion to it.
         pace: share of these rates at which SIRENs learn; see `Pace`.
-
-    Returns:
-        Dicts with ``params`` and ``lr``.
 
     Raises:
         ValueError: a rate or a pace is not positive.
@@ -56,7 +46,8 @@ def parameter_groups(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -
     positive(lr=lr)
     groups, taken = [], set()
     for siren, rates in _wanted(field, pace):
-        for params, wanted, unit in zip(_parts(siren), rates, siren.units, strict=True):
+        parts = list(siren.layers.parameters()), list(siren.output.parameters())
+        for params, wanted, unit in zip(parts, rates, siren.units, strict=True):
             groups.append({"params": params, "lr": lr / HOST_RATE * wanted / unit})
             taken.update(map(id, params))
     rest = [parameter for parameter in field.parameters() if id(parameter) not in taken]
@@ -64,14 +55,14 @@ def parameter_groups(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -
 
 
 def rescale_parameters(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -> None:
-    """Keep a field's parameters in units in which one rate serves all of them; the field stays the same function.
+    """Keep a field's parameters, in place, in units in which one rate suits all; the field stays the same function.
 
-    The units are powers of two (`Siren.set_units`), so that values and jets stay the same bit for bit; the steps are
-    those of `parameter_groups` to within a factor of √2.
+    Units are powers of two (`Siren.set_units`), so values and jets stay the same bit for bit; steps are those of
+    `parameter_groups` within a factor of √2. To be called before an optimiser is made.
 
     Args:
-        field: changed in place; before an optimiser has seen it.
-        lr: at which the host will train it, at the peak of its schedule.
+        field: changed in place.
+        lr: the host's rate, at the peak of its schedule.
         pace: see `Pace`.
 
     Raises:
@@ -93,13 +84,8 @@ def rescale_parameters(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0)
         siren.set_units(sines, output)
 
 
-def _parts(siren: Siren) -> tuple[Sequence[nn.Parameter], Sequence[nn.Parameter]]:
-    """Parameters of the sine layers, and those of the output."""
-    return list(siren.layers.parameters()), list(siren.output.parameters())
-
-
 def _wanted(field: Field, pace: Pace) -> Iterator[tuple[Siren, tuple[float, float]]]:
-    """Each SIREN with Adam's rates for weights and biases of its sine layers, and for those of its output."""
+    """Each SIREN with Adam's rates for its sine layers and for its output."""
     paces = [pace] if isinstance(pace, float | int) else list(pace)
     for share in paces:
         positive(pace=share)

@@ -9,8 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-__all__ = ["linear_to_srgb", "srgb_to_linear"]
-
 Floats = TypeVar("Floats", NDArray[np.float32], NDArray[np.float64])
 
 # Where the straight piece near black meets the power curve, on either side.
@@ -22,12 +20,9 @@ def srgb_to_linear(x: Tensor) -> Tensor: ...
 @overload
 def srgb_to_linear(x: Floats) -> Floats: ...
 def srgb_to_linear(x: Any) -> Any:
-    """Display numbers of any shape → linear light: ``x / 12.92`` up to 0.04045, else ``((x + 0.055) / 1.055)^2.4``.
+    """Display numbers in [0, 1] → linear light: ``x / 12.92`` up to 0.04045, else ``((x + 0.055) / 1.055)^2.4``.
 
     Linear light is what may be averaged: half of the light of white is 0.735 on the display, not 0.5.
-
-    Args:
-        x: floating-point numbers in [0, 1]; differentiable where it is a tensor.
     """
     if isinstance(x, Tensor):
         return torch.where(x <= KNEE_DISPLAY, x / 12.92, ((x.clamp(min=KNEE_DISPLAY) + 0.055) / 1.055) ** 2.4)
@@ -40,11 +35,7 @@ def linear_to_srgb(x: Tensor) -> Tensor: ...
 @overload
 def linear_to_srgb(x: Floats) -> Floats: ...
 def linear_to_srgb(x: Any) -> Any:
-    """Linear light of any shape → display numbers; the inverse of `srgb_to_linear`.
-
-    Args:
-        x: floating-point numbers in [0, 1]; differentiable where it is a tensor.
-    """
+    """Linear light in [0, 1] → display numbers; the inverse of `srgb_to_linear`."""
     if isinstance(x, Tensor):
         return torch.where(x <= KNEE_LINEAR, x * 12.92, 1.055 * x.clamp(min=KNEE_LINEAR) ** (1 / 2.4) - 0.055)
     curve = 1.055 * np.maximum(x, KNEE_LINEAR) ** (1 / 2.4) - 0.055

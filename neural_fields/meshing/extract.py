@@ -10,20 +10,27 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import normalize
 
-from ..backend._checks import positive
-from ..fields.function import FieldLike, as_field
-from ._blocks import ActiveCells, NoSurfaceError, active_cells, cull_blocks
-from ._cube import EDGE_AXIS, EDGE_ENDS, cube_tables
-from ._lattice import Bounds, Lattice, Progress, Sampler
+from ..backend.errors import positive
+from ..fields.field import FieldLike, as_field, solid
+from ._cells import (
+    EDGE_AXIS,
+    EDGE_ENDS,
+    ActiveCells,
+    Bounds,
+    Lattice,
+    Progress,
+    Sampler,
+    active_cells,
+    cube_tables,
+    cull_blocks,
+)
+from ._cells import NoSurfaceError as NoSurfaceError
 from .mesh import Mesh, MeshStats
-
-__all__ = ["Mesh", "MeshStats", "NoSurfaceError", "extract_mesh", "map_normals"]
 
 # The unit sphere with a little room, so that a surface that touches it is still closed.
 DEFAULT_BOUNDS: Bounds = ((-1.02, -1.02, -1.02), (1.02, 1.02, 1.02))
 
-# Cells that a vertex may move before its normal is taken anew: a twentieth of a cell turns the normal by 0.3 degrees
-# where the radius of curvature is ten cells.
+# Cells a vertex may move before its normal is evaluated again: 0.3 degrees at a radius of curvature of ten cells.
 RENEWED_NORMAL = 0.05
 
 
@@ -41,16 +48,14 @@ def extract_mesh(
 ) -> Mesh:
     """Extract the zero set of ``field`` inside a box, outward oriented, with analytic normals.
 
-    Blocks are culled by the bound of `cull_blocks`, |f_j(centre)| ≤ L · half diagonal + δ_j, with coarse levels
-    for large blocks; corner signs are inferred by the same bound where it decides them; the rest is evaluated,
-    and both ends of every crossed edge always are. So the work grows with the number of surface cells (×4 when
-    the resolution doubles) and no array of resolution³ exists. With |∇f| ≤ L the mesh equals the one from
-    evaluating every lattice point. Where f is steeper, the surface is still followed across every face of
-    the lattice, so it is closed; only a whole component that no centre noticed could be missed.
+    Blocks are culled by the bound |f_j(centre)| ≤ L · half diagonal + δ_j, with coarse levels for large blocks. Corner
+    signs that the bound decides are inferred; both ends of every crossed edge are evaluated. So the work grows with the
+    number of surface cells (×4 when the resolution doubles) and no array of resolution³ exists. With |∇f| ≤ L the mesh
+    equals that of evaluating every lattice point. Where f is steeper, the surface is still followed across every face
+    of the lattice; only a whole component that no centre noticed could be missed.
 
-    The mesh is watertight and manifold where it stays inside the box; a surface that leaves the box is left
-    open there. Vertices lie on lattice edges, by linear interpolation; with normals, whose jets know value and
-    slope at the vertices, by one Newton step more along the edge.
+    The mesh is watertight and manifold inside the box, and open where the surface leaves it. Vertices lie on lattice
+    edges, by linear interpolation and, with normals, one more Newton step along the edge.
 
     Args:
         field: three-dimensional, negative inside, evaluated on the device of its parameters; or any function of points
@@ -60,14 +65,14 @@ def extract_mesh(
         bounds: lowest and highest corner of the box.
         lipschitz: L, an upper bound on |∇f| near the surface and within a block of it; 1 for an exact distance.
         normals: whether normals are computed; their jets cost about twice the value at every vertex.
-        clearance: least distance of a vertex from the ends of its edge, in cells, so that no two vertices
-            coincide where f is exactly zero at a lattice point (which counts as outside).
+        clearance: least distance of a vertex from the ends of its edge, in cells, so that no two vertices coincide
+            where f is exactly zero at a lattice point (which counts as outside).
         batch: points per call of the field.
         progress: called with ``(stage, done, total)`` after every batch.
 
     Raises:
-        NoSurfaceError: no lattice point differs in sign from another; says what the signs are.
-        ValueError: the field gave NaN or an infinity, or an argument is out of range.
+        NoSurfaceError: no two lattice points differ in sign; the message says what the signs are.
+        ValueError: the field returned NaN or an infinity, or an argument is out of range.
 
     Example:
         >>> from mplicits.neural_fields import Sphere
@@ -75,9 +80,7 @@ def extract_mesh(
         >>> bool(abs((mesh.vertices**2).sum(axis=1) ** 0.5 - 0.5).max() < 1e-5)
         True
     """
-    field = as_field(field)
-    if field.in_dim != 3:
-        raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")
+    field = solid(field)
     positive(lipschitz=lipschitz, batch=batch)
     if not 0 < clearance < 0.5:
         raise ValueError(f"clearance={clearance}: expected a fraction of a cell in (0, 0.5)")
@@ -116,19 +119,11 @@ def extract_mesh(
 
 @torch.no_grad()
 def map_normals(mesh: Mesh, field: FieldLike, *, level: int = -1, batch: int = 1 << 18) -> Mesh:
-    """Neural normal mapping: the mesh with a field's normals at its vertices (paper Sec. 3).
+    """Neural normal mapping (paper, Sec. 3): the mesh with normals ∇f_j(p) / |∇f_j(p)| at its vertices p.
 
-    Each vertex p gets ∇f_j(p) / |∇f_j(p)|. For an f_j that is a distance this is the normal of its surface at the point
-    nearest to p, so a coarse mesh shades like a fine one as long as it stays within the bands of the level.
-
-    Args:
-        mesh: in the field's own coordinates; of a coarse level, say.
-        field: on the device of its parameters; or a function, as in `extract_mesh`.
-        level: whose gradient to take.
-        batch: points per call of the field.
-
-    Raises:
-        ValueError: there is no such level.
+    For an f_j that is a distance this is the normal of its surface at the point nearest to p: a coarse mesh, in the
+    field's coordinates, shades like a fine one as long as it stays within the bands of the level. ``batch`` is points
+    per call.
     """
     field = as_field(field)
     points = torch.from_numpy(mesh.vertices).to(field.like)
@@ -155,8 +150,7 @@ def _newton(
 def _triangles(cells: ActiveCells) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Connect the crossed edges of the cells.
 
-    Returns:
-        Faces ``(F, 3)``, and for each vertex the rows ``(V, 2)`` of the lattice points its edge runs between.
+    Returns faces ``(F, 3)``, and for each vertex the rows ``(V, 2)`` of the lattice points at the ends of its edge.
     """
     tables = cube_tables()
     number = np.zeros(3 * len(cells.points), np.int32)

@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["GENERATOR", "MATERIAL", "Motion", "write_glb"]
-
 GENERATOR = "mplicits"
 
 MATERIAL, ROUGHNESS = "baked", 0.8
@@ -24,7 +22,7 @@ _SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071
 
 
 class Motion(NamedTuple):
-    """How a mesh moves: times ``(T,)`` in seconds, and by how much each of the ``T − 1`` later frames differs."""
+    """Times ``(T,)`` in seconds, and for each of the ``T − 1`` later frames its difference from the first."""
 
     times: NDArray[np.floating]
     targets: Sequence[Mapping[str, NDArray[Any]]]
@@ -46,10 +44,9 @@ def write_glb(
     Args:
         path: the file; replaced.
         faces: ``(F, 3)``.
-        attributes: by glTF's names, POSITION among them, ``(V, 2 | 3 | 4)`` float32 each, or uint16 that stands for
-            fractions of 65535.
-        images: PNG files of "color" and "normal", where there are any.
-        node: how the mesh stands in the scene, by glTF's names: translation, rotation, scale, extras.
+        attributes: by glTF's names, POSITION among them, ``(V, 2 | 3 | 4)`` float32, or uint16 as fractions of 65535.
+        images: PNG files of "color" and "normal", if any.
+        node: placement of the mesh by glTF's names: translation, rotation, scale, extras.
         motion: of the attributes, played by an animation.
     """
     images = images or {}
@@ -100,7 +97,7 @@ def write_glb(
 
 
 def _add_motion(header: dict[str, Any], motion: Motion, first: int, times: int) -> None:
-    """Describe a motion whose arrays begin at the accessor ``first``, and whose times are the accessor ``times``."""
+    """Describe a motion whose arrays begin at accessor ``first``, and whose times are accessor ``times``."""
     described, accessor = [], first
     for target in motion.targets:
         described.append({name: accessor + k for k, name in enumerate(target)})

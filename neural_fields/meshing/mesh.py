@@ -1,8 +1,6 @@
 """``Mesh``, and its way to PLY, OBJ, STL and GLB files: complete or not at all, in float64 where a format has it.
 
-All mesh files are written here: those of `Mesh.export` and those of the commands, with textures and moving ones too.
-Colours are display numbers in PLY and OBJ, linear light in GLB. How coordinates are turned and scaled for other
-programs says a `Placement`.
+Colours are display numbers in PLY and OBJ, linear light in GLB. A `Placement` turns and scales coordinates.
 """
 
 from __future__ import annotations
@@ -24,41 +22,20 @@ from .color_space import srgb_to_linear
 from .glb import MATERIAL, Motion, write_glb
 from .placement import Placement
 
-__all__ = [
-    "Mesh",
-    "MeshStats",
-    "check_mesh_path",
-    "glb_attributes",
-    "glb_origin",
-    "needs_doubles",
-    "write_glb_mesh",
-    "write_obj",
-    "write_triangles",
-]
-
 Float64 = NDArray[np.float64]
 Origin = tuple[float, float, float]
 
-# float32 rounds a coordinate c by up to 6e-8 |c|. Up to this many scales from the origin that is less than a
-# hundredth of a cell at 2048³.
-FLOAT32_REACH = 128.0
+FLOAT32_REACH = 128.0  # scales from the origin, up to which float32 rounds by less than a hundredth cell at 2048³
 
 
 @dataclass(frozen=True)
 class MeshStats:
-    """What an extraction cost.
+    """Cost of an extraction."""
 
-    Attributes:
-        points: how many points were sent to each level (a level may answer a part of them by a coarser one).
-        blocks: surviving blocks of 2³ cells.
-        cells: cells that the surface crosses.
-        seconds: wall time of each stage: "cull", "corners", "triangles", "normals".
-    """
-
-    points: tuple[int, ...]
-    blocks: int
-    cells: int
-    seconds: dict[str, float]
+    points: tuple[int, ...]  # sent to each level (a level may answer some by a coarser one)
+    blocks: int  # surviving blocks of 2³ cells
+    cells: int  # that the surface crosses
+    seconds: dict[str, float]  # wall time of each stage: "cull", "corners", "triangles", "normals"
 
 
 @dataclass(frozen=True)
@@ -70,11 +47,11 @@ class Mesh:
     Attributes:
         vertices: ``(V, 3)`` float64.
         faces: ``(F, 3)`` integers, counter-clockwise as seen from outside (the positive side).
-        normals: ``(V, 3)`` unit vectors, outward; None where they are not known.
-        colors: ``(V, 3)`` display RGB in [0, 1], or None.
+        normals: ``(V, 3)`` unit vectors, outward; or None.
+        colors: ``(V, 3)`` display RGB in [0, 1]; or None.
         uv: ``(V, 2)`` texture coordinates, v upwards; vertices on seams are repeated, once per chart. Or None.
-        tangents: ``(V, 4)`` as glTF has them, or None.
-        stats: what it cost, for a mesh that `extract_mesh` made.
+        tangents: ``(V, 4)`` as in glTF; or None.
+        stats: of `extract_mesh`; or None.
     """
 
     vertices: Float64
@@ -86,12 +63,12 @@ class Mesh:
     stats: MeshStats | None = None
 
     def used_vertices(self) -> Float64:
-        """The vertices that a face uses; all of them where there are no faces."""
+        """The vertices of faces; all vertices where there are no faces."""
         return self.vertices[np.unique(self.faces)] if len(self.faces) else self.vertices
 
     @cached_property
     def merged(self) -> Mesh:
-        """Vertices and faces alone, exactly equal vertices made one; faces that collapse by it are dropped."""
+        """Vertices and faces alone, equal vertices made one; faces that collapse by it are dropped."""
         order = np.lexsort(self.vertices.T[::-1])
         rows = self.vertices[order]
         first = np.ones(len(rows), bool)
@@ -107,12 +84,9 @@ class Mesh:
         return dataclasses.replace(self, vertices=similarity.to_unit(self.vertices))
 
     def placed(self, suffix: str, home: Similarity, placement: Placement) -> tuple[Mesh, bool]:
-        """The same, turned and scaled as ``placement`` asks of a file, and whether doubles are needed there.
+        """The mesh as a file with this ``suffix`` has it by ``placement``, and whether it needs doubles there.
 
-        Args:
-            suffix: of the file.
-            home: where in input coordinates the mesh is, and how large.
-            placement: what is asked for.
+        ``home`` is the place and size of the mesh in input coordinates.
         """
         place = placement.into(suffix, self.vertices)
         if not place.changes:
@@ -122,9 +96,7 @@ class Mesh:
         return placed, needs_doubles(place.home(home))
 
     def to_trimesh(self) -> Any:
-        """The mesh as a ``trimesh.Trimesh``: the same vertices in the same order, in float64, with normals and colours.
-
-        Colours have 8 bits there, and an alpha of 255.
+        """The mesh as a ``trimesh.Trimesh``: the same vertices in float64, with normals, and colours in 8 bits.
 
         Example:
             >>> from mplicits.neural_fields import Sphere, extract_mesh
@@ -144,22 +116,22 @@ class Mesh:
         )
 
     def export(self, path: str | Path, *, up: str | None = None, unit: str | None = None, center: bool = False) -> None:
-        """Write the mesh as PLY, OBJ, STL or GLB, as ``mplicits mesh`` does; the extension chooses.
+        """Write the mesh as PLY, OBJ, STL or GLB, by the extension, as ``mplicits mesh`` does.
 
-        Normals and colours go where the format has room for them. Coordinates are doubles in PLY and OBJ where floats
+        Normals and colours are written where the format has them. Coordinates are doubles in PLY and OBJ where floats
         would spoil them; a GLB keeps its offset from the origin in float64.
 
         Args:
             path: the file; it has its name only when it is complete.
-            up: the axis that points up in the mesh, "y" or "z". A GLB is y-up, and z is turned up there; the others
-                are turned (OBJ to y-up, PLY and STL to z-up) if it is given.
-            unit: of the coordinates, "mm", "cm", "m", … (`Placement`). A GLB is in metres, by its node; the others
-                are scaled (to millimetres in STL, else to metres) if it is given.
+            up: the axis that points up in the mesh, "y" or "z". A GLB is y-up, and z is turned up there; the others are
+                turned (OBJ to y-up, PLY and STL to z-up) if it is given.
+            unit: of the coordinates, "mm", "cm", "m", … (`Placement`). A GLB is in metres, by its node; the others are
+                scaled (to millimetres in STL, else to metres) if it is given.
             center: whether the middle of the bounding box goes to the origin.
 
         Raises:
-            InputError: the extension is unknown, the file cannot be written, or STL has too few digits for coordinates
-                so far from the origin.
+            InputError: the extension is unknown, the file cannot be written, or STL has too few digits so far from the
+                origin.
             ValueError: there is no such axis or unit, or the mesh has no faces.
         """
         if not len(self.faces):
@@ -172,16 +144,9 @@ class Mesh:
 
 
 def check_mesh_path(path: str | Path, similarity: Similarity | None = None, *, centered: bool = False) -> Path:
-    """Whether a mesh can be written to ``path``, to be asked before any long work.
+    """``path`` as a Path; InputError if no mesh can be written there, to be called before any long work.
 
-    Args:
-        path: the file to be; an existing file would be replaced.
-        similarity: that of the field, where it is known already.
-        centered: whether the mesh will be centred at the origin.
-
-    Raises:
-        InputError: the extension is unknown or cannot hold the coordinates, ``path`` is a folder, or a file cannot
-            come to be there (`check_place`).
+    ``similarity`` is that of the field, if known already; ``centered`` whether the mesh will be centred at the origin.
     """
     path = Path(path)
     if path.suffix.lower() not in _WRITERS:
@@ -200,25 +165,16 @@ def check_mesh_path(path: str | Path, similarity: Similarity | None = None, *, c
 
 
 def needs_doubles(similarity: Similarity) -> bool:
-    """Whether the coordinates are so far from the origin, as map coordinates are, that float32 would spoil them."""
+    """Whether float32 would spoil the coordinates, so far from the origin as map coordinates are."""
     return max(abs(c) for c in similarity.center) > FLOAT32_REACH * similarity.scale
 
 
 def write_triangles(path: str | Path, mesh: Mesh, home: Similarity, placement: Placement | None = None) -> None:
-    """Write a mesh; the extension chooses the format, and the file has its name only when it is complete.
+    """Write a mesh in input coordinates, in the format of the extension; it has its name only when it is complete.
 
-    PLY is binary, with double coordinates where float would spoil them (see `needs_doubles`), normals and colours;
-    OBJ has normals and colours; STL (binary) neither. GLB is float32 by its standard, with the map into the scene in
-    its node; see `write_glb_mesh`.
-
-    Args:
-        path: the file.
-        mesh: in input coordinates.
-        home: where in them it is, and how large.
-        placement: what is known of the input's coordinates; by default nothing.
-
-    Raises:
-        InputError: see `check_mesh_path`; or the disk is full.
+    PLY is binary, with doubles where needed (`needs_doubles`), normals and colours; OBJ has normals and colours; STL
+    (binary) neither; for GLB see `write_glb_mesh`. ``home`` is the place and size of the mesh. Errors are those of
+    `check_mesh_path`.
     """
     placement = placement or Placement()
     path = check_mesh_path(path, home, centered=placement.center)
@@ -237,16 +193,8 @@ def write_glb_mesh(
 ) -> None:
     """Write a GLB whose positions are the input's, less an origin, and whose node turns them y-up and into metres.
 
-    The ``extras`` of the node keep that origin, and the unit and the axis where they were given: positions plus origin
-    are input coordinates, whatever the node does.
-
-    Args:
-        path: the file; replaced.
-        mesh: in input coordinates.
-        home: where in them it is, and how large.
-        placement: what is known of the input's coordinates.
-        images: see `write_glb`.
-        motion: see `write_glb`; of attributes from `glb_attributes`.
+    The ``extras`` of the node keep that origin, and unit and axis if given: positions plus origin are input
+    coordinates. ``images`` and ``motion`` (of attributes from `glb_attributes`) are those of `write_glb`.
     """
     origin = glb_origin(mesh.vertices, home, placement)
     known = {"up": placement.up, "unit": placement.unit}
@@ -256,13 +204,7 @@ def write_glb_mesh(
 
 
 def glb_origin(vertices: Float64, home: Similarity, placement: Placement) -> Origin:
-    """What the positions of a GLB are relative to: far away or centred, the middle, so that float32 suffices for them.
-
-    Args:
-        vertices: ``(V, 3)`` in input coordinates.
-        home: where in them they are, and how large their shape is.
-        placement: see `write_glb_mesh`.
-    """
+    """The origin of a GLB's positions: the middle where they are far away or centred, so that float32 suffices."""
     if placement.center:
         x, y, z = placement.into(".glb", vertices).middle.tolist()
         return x, y, z
@@ -270,7 +212,7 @@ def glb_origin(vertices: Float64, home: Similarity, placement: Placement) -> Ori
 
 
 def glb_attributes(mesh: Mesh, origin: Origin) -> dict[str, NDArray[Any]]:
-    """What a mesh in input coordinates has at its vertices, as glTF names and stores it."""
+    """Vertex attributes of a mesh in input coordinates, as glTF names and stores them."""
     attributes: dict[str, NDArray[Any]] = {"POSITION": (mesh.vertices - origin).astype("<f4")}
     if mesh.normals is not None:
         attributes["NORMAL"] = mesh.normals.astype("<f4")
@@ -287,14 +229,7 @@ def glb_attributes(mesh: Mesh, origin: Origin) -> dict[str, NDArray[Any]]:
 
 
 def write_obj(path: Path, mesh: Mesh, *, double: bool, library: str | None = None) -> None:
-    """The lines of an OBJ file; all that a vertex has, has its number.
-
-    Args:
-        path: the file; replaced.
-        mesh: in the coordinates of the file.
-        double: whether coordinates need more digits than float32 has.
-        library: name of the MTL file beside it.
-    """
+    """Write an OBJ file, with fifteen digits if ``double``, and the name ``library`` of an MTL file beside it."""
     line, rows = "v " + " ".join(["%.15g" if double else "%.9g"] * 3), mesh.vertices
     if mesh.colors is not None:
         line, rows = line + " %.4g %.4g %.4g", np.concatenate((rows, mesh.colors), axis=1)

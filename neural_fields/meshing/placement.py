@@ -1,4 +1,4 @@
-"""How the coordinates of an input become those that other programs expect: which axis is up, how long a unit is."""
+"""From the coordinates of an input to those that other programs expect: up axis and unit."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from ..fields.similarity import Similarity
 
-__all__ = ["FRAMES", "METRES", "UP_AXES", "FileTransform", "Frame", "Placement"]
-
 Float64 = NDArray[np.float64]
 
 METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "in": 0.0254, "ft": 0.3048}
@@ -22,17 +20,11 @@ Z_TO_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 class Frame(NamedTuple):
-    """What programs take the coordinates of a format for.
+    """The coordinates that programs expect of a format."""
 
-    Attributes:
-        up: the axis.
-        unit: a key of `METRES`.
-        always: whether that is so by the standard, so that files follow it unasked; else it is what importers assume.
-    """
-
-    up: str
-    unit: str
-    always: bool
+    up: str  # axis
+    unit: str  # a key of `METRES`
+    always: bool  # whether the standard fixes them, so that files follow unasked
 
 
 # glTF 2.0, Sec. 3.4: +y up, metres. Slicers take STL for millimetres on the xy-plane. Blender's importers take PLY and
@@ -47,14 +39,14 @@ FRAMES = {
 
 @dataclass(frozen=True)
 class Placement:
-    """What is known of an input's coordinates, and whether its shape shall stand at the origin.
+    """Known properties of an input's coordinates, and whether the shape is centred at the origin.
 
-    A GLB is y-up and in metres by its standard; where nothing is said, the input is taken to be so as well. In PLY,
-    OBJ and STL the coordinates of the input stay as they are but for what is said here.
+    A GLB is y-up and in metres by its standard, and so is the input unless given here. In PLY, OBJ and STL coordinates
+    change only as given here.
 
     Attributes:
         up: the axis that points up in the input, "y" or "z".
-        unit: the length of one input unit, a key of `METRES`: "mm", "cm", "m", ….
+        unit: length of one input unit, a key of `METRES`: "mm", "cm", "m", ….
         center: whether the middle of the shape's bounding box goes to the origin.
 
     Raises:
@@ -72,12 +64,7 @@ class Placement:
             raise ValueError(f"unit={self.unit!r}: expected one of {', '.join(METRES)}")
 
     def into(self, suffix: str, vertices: Float64) -> FileTransform:
-        """The map from input coordinates to those of a file.
-
-        Args:
-            suffix: of the file, a key of `FRAMES`.
-            vertices: ``(V, 3)`` in input coordinates; their box is what is centred.
-        """
+        """The map from input coordinates to those of a file (``suffix`` a key of `FRAMES`); centres ``vertices``."""
         frame = FRAMES[suffix.lower()]
         turn = np.eye(3)
         if self.up is not None and self.up != frame.up:
@@ -87,11 +74,7 @@ class Placement:
         return FileTransform(turn, scale, middle)
 
     def describe(self, suffix: str) -> str | None:
-        """A line that says what a file's coordinates are, and what was taken for granted; None: they are the input's.
-
-        Args:
-            suffix: of the file, a key of `FRAMES`.
-        """
+        """A line about a file's coordinates and what was assumed; None if they are the input's."""
         frame = FRAMES[suffix.lower()]
         words = []
         if self.up is not None or frame.always:
@@ -112,17 +95,11 @@ class Placement:
 
 
 class FileTransform(NamedTuple):
-    """The map ``x → scale · turn (x − middle)``, float64.
+    """The map ``x → scale · turn (x − middle)``, float64."""
 
-    Attributes:
-        turn: ``(3, 3)``, a rotation by right angles.
-        scale: file units per input unit.
-        middle: ``(3,)`` in input coordinates, what goes to the origin.
-    """
-
-    turn: Float64
-    scale: float
-    middle: Float64
+    turn: Float64  # (3, 3), a rotation by right angles
+    scale: float  # file units per input unit
+    middle: Float64  # (3,) in input coordinates
 
     @property
     def changes(self) -> bool:
@@ -134,16 +111,16 @@ class FileTransform(NamedTuple):
         return self.scale * (rows - self.middle) @ self.turn.T
 
     def directions(self, rows: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Directions ``(..., 3)``, turned; their length and precision stay."""
+        """Directions ``(..., 3)``, turned; length and precision stay."""
         return rows @ self.turn.T.astype(rows.dtype)
 
     def home(self, similarity: Similarity) -> Similarity:
-        """Where the shape is in the file, and how large, if ``similarity`` says it of the input."""
+        """Place and size of the shape in the file, from those in the input."""
         x, y, z = self.points(np.asarray(similarity.center)).tolist()
         return Similarity((x, y, z), similarity.scale * self.scale)
 
     def node(self, origin: tuple[float, float, float]) -> dict[str, Any]:
-        """The same map as translation, rotation and scale of a glTF node, for positions relative to ``origin``."""
+        """The map as translation, rotation and scale of a glTF node, for positions relative to ``origin``."""
         translation = (self.points(np.asarray(origin)) + 0.0).tolist()  # no negative zero
         node: dict[str, Any] = {"translation": translation}
         if (self.turn != np.eye(3)).any():

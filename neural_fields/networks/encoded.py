@@ -1,30 +1,27 @@
-"""Geometry whose features are joined by learnt ones of the position: detail of colour that no surface has to carry."""
+"""Fields with a learnt encoding of the position among their features: colour detail that the surface need not carry."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from ..backend._checks import positive
-from ..fields.field import Field, Jet, SecondJet
-from ..fields.function import FieldLike, as_field
+from ..backend.errors import positive
+from ..fields.field import FieldLike, Jet, SecondJet, Wrapper, solid
 from .hash_encoding import HashEncoding
 
-__all__ = ["EncodedField"]
 
+class EncodedField(Wrapper):
+    """A three-dimensional field whose features are its own, followed by ``gain · e(x)`` of a hash encoding e.
 
-class EncodedField(Field):
-    """A field whose features are its own and, after them, ``gain · e(x)`` of a hash encoding e.
-
-    A colour network of a NeuS-style host gets the detail of the position from these features, so that the surface need
-    not bend for it: value, gradient, levels and bands stay those of the field. Hosts set one learning rate for all,
-    which is too low for a table; the gain makes up for that.
+    A colour network of a NeuS-style host gets positional detail from these features, so that the surface need not bend
+    for it: value, gradient, levels and bands stay those of the field.
 
     Args:
-        field: three-dimensional; a part of this module.
-        grid: the encoding e, a part of this module too; one of 24 features over the cube ±1 by default.
-        gain: factor on what it says. Tables learn at 0.01 in Instant-NGP (Müller et al. 2022, Sec. 4); entries that
-            count 64 times learn as if at 0.03 beside networks at 5e-4, as Adam's steps do not depend on their size.
+        field: a part of this module.
+        grid: the encoding e; one of 24 features over the cube ±1 by default.
+        gain: factor on e. Hosts have one rate for all, too low for a table: Instant-NGP (Müller et al. 2022, Sec. 4)
+            learns them at 0.01. With 64, entries learn as if at 0.03 beside networks at 5e-4, as Adam's steps have a
+            fixed size.
 
     Raises:
         ValueError: the field is not three-dimensional, or the gain not positive.
@@ -43,29 +40,13 @@ class EncodedField(Field):
     def __init__(self, field: FieldLike, grid: HashEncoding | None = None, *, gain: float = 64.0) -> None:
         super().__init__()
         positive(gain=gain)
-        self.field = as_field(field)
-        if self.field.in_dim != 3:
-            raise ValueError(f"field.in_dim={self.field.in_dim}: expected 3, as positions are encoded")
+        self.field = solid(field)
         self.gain, self.num_levels = float(gain), self.field.num_levels
         if grid is None:
             grid = HashEncoding()
             with torch.no_grad():  # features begin as small as those of an encoding without a gain
                 grid.table.div_(gain)
         self.grid = grid
-
-    @property
-    def same_rows(self) -> bool:
-        """Whether it holds for the field that is encoded."""
-        return self.field.same_rows
-
-    @property
-    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands, the field's own."""
-        return self.field.deltas
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        """See `Field.value`."""
-        return self.field.value(x, level=level)
 
     def value_features(self, x: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
         """See `Field.value_features`."""
@@ -81,10 +62,6 @@ class EncodedField(Field):
         """See `Field.second_jet`."""
         jet = self.field.second_jet(x, level=level, dims=dims)
         return jet._replace(features=self._joined(jet.features, x))
-
-    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
-        """See `Field.level_values`."""
-        return self.field.level_values(x, level=level)
 
     def _joined(self, features: Tensor, x: Tensor) -> Tensor:
         return torch.cat((features, self.gain * self.grid(x)), dim=-1)

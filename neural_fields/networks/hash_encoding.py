@@ -1,8 +1,4 @@
-"""Instant-NGP's multiresolution hash encoding (Müller et al. 2022), in plain PyTorch: positions as learnt features.
-
-Every level is a grid whose vertices own entries of a table: one each where the grid fits into the table (Sec. 3), or
-else the one that a spatial hash says (Eq. 4), which they share. Entries are interpolated, and levels joined.
-"""
+"""Instant-NGP's multiresolution hash encoding (Müller et al. 2022) in plain PyTorch."""
 
 from __future__ import annotations
 
@@ -12,9 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import at_least, positive
-
-__all__ = ["HashEncoding", "check_table", "grid_resolutions", "spatial_hash", "tables_apart"]
+from ..backend.errors import at_least, positive
 
 INITIAL = 1e-4  # entries begin uniform in ±INITIAL (Sec. 4)
 
@@ -45,34 +39,18 @@ def check_table(table_size: int, coarsest: int, finest: int) -> None:
 
 
 def tables_apart(*modules: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
-    """The tables of hash encodings among the parameters of modules, and all others: each wants a rate of its own."""
+    """The tables of hash encodings among the parameters of modules, and all others, which want another rate."""
     tables = [part.table for module in modules for part in module.modules() if isinstance(part, HashEncoding)]
     known = {id(table) for table in tables}
     return tables, [p for module in modules for p in module.parameters() if id(p) not in known]
 
 
 class HashEncoding(nn.Module):
-    """Features of positions, piecewise trilinear, learnt with whatever reads them.
+    """Features of positions, piecewise trilinear, learnt with the network that reads them.
 
-    All levels are in one table and are looked up at once. Positions outside the cube have the features of its nearest
-    point.
-
-    Args:
-        levels: grids, L in the paper.
-        table_size: most entries of a level, T; a power of two.
-        features: numbers per entry, F.
-        coarsest: cells along a side of the first grid, N_min.
-        finest: cells along a side of the last grid, N_max.
-        extent: half-edge of the cube that the grids cover.
-
-    Raises:
-        ValueError: an argument is out of range.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields.networks.hash_encoding import HashEncoding
-        >>> HashEncoding(levels=4, finest=128)(torch.zeros(5, 3)).shape
-        torch.Size([5, 8])
+    ``levels`` grids (L) from ``coarsest`` (N_min) to ``finest`` (N_max) cells along a side cover the cube ±``extent``.
+    Their vertices own table entries of ``features`` (F) numbers: one each where the grid fits into ``table_size`` (T, a
+    power of two; Sec. 3), else a shared one by a spatial hash (Eq. 4). Outside the cube its nearest point counts.
     """
 
     def __init__(
@@ -104,19 +82,18 @@ class HashEncoding(nn.Module):
 
     @classmethod
     def up_to(cls, finest: int, *, extent: float = 1.0) -> HashEncoding:
-        """One from 16 cells along a side, or fewer if the last grid has fewer, to ``finest``."""
+        """An encoding from 16 cells along a side, or ``finest`` if that is less, to ``finest``."""
         return cls(coarsest=min(16, finest), finest=finest, extent=extent)
 
     @property
     def size(self) -> int:
-        """How many numbers a position becomes."""
+        """The number of features of a position."""
         return len(self.resolutions) * self.table.shape[1]
 
     def forward(self, x: Tensor) -> Tensor:
         """Features ``(..., L F)`` of positions ``(..., 3)``; differentiable by the table and by ``x``.
 
-        In the precision of the table, under ``autocast`` too: half of it has no digits left for where in a cell of a
-        fine grid a position is.
+        In the precision of the table, under ``autocast`` too: half precision cannot place a position in a fine cell.
         """
         with torch.autocast(x.device.type, enabled=False):
             return self._looked_up(x.to(self.table.dtype))
@@ -143,7 +120,7 @@ class HashEncoding(nn.Module):
 
 
 class _Lookup(torch.autograd.Function):
-    """Weighted sums of rows of a table. PyTorch's own way back takes four times as long, most of it in sorting."""
+    """Weighted sums of table rows; PyTorch's own backward takes four times as long, mostly for sorting."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, entries: Tensor, weights: Tensor) -> Tensor:

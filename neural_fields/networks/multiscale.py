@@ -1,7 +1,6 @@
 """The paper's multiscale SDF (Sec. 3.1): a base field plus residuals, each one only in the band before it.
 
-f_0 is the base; f_{j+1} = f_j + γ(|f_j| / δ_j) r_j where every coarser level is inside its own band, and f_j
-elsewhere. The gate γ lives here and nowhere else, and so does the one loop that walks from level to level.
+f_0 is the base; f_{j+1} = f_j + γ(|f_j| / δ_j) r_j where every coarser level is inside its own band, and f_j elsewhere.
 """
 
 from __future__ import annotations
@@ -13,17 +12,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from ..backend._transforms import under_vmap
+from ..backend.devices import under_vmap
 from ..backend.fixed_shapes import FixedShapes, Rows, current_shapes
 from ..backend.kernels.switch import Choice, choose
-from ..fields.field import Field, Jet, SecondJet
-from ..fields.function import FieldLike, as_field
+from ..fields.field import Field, FieldLike, Jet, SecondJet, as_field
 from .siren import Siren, needs_graph
 
 if TYPE_CHECKING:
     from ..backend.kernels.levels import Levels
-
-__all__ = ["MultiscaleSDF", "Parts", "as_levels", "choose_levels", "levels_of", "walk_levels"]
 
 # The tensors of a jet of any order, the value first; ``(N,)``, alone or with features, is a jet of order 0.
 Parts = tuple[Tensor, ...]
@@ -32,10 +28,9 @@ Parts = tuple[Tensor, ...]
 class MultiscaleSDF(Field):
     """Nested residual levels around the surface of a base field.
 
-    Rows outside a band are gathered away before the residual sees them, so they cost nothing (see `fixed_shapes` for
-    GPUs, which wait for such a gathering). The gate is
-    the paper's hard one for ``taper=0``; otherwise it falls from 1 at ``(1 − taper) δ`` to 0 at δ as the
-    cubic 1 − u²(3 − 2u), which makes value and gradient continuous for renderers that differentiate them.
+    Rows outside a band are gathered away before the residual is evaluated (see `fixed_shapes` for GPUs, which would
+    wait for that). The gate is the paper's hard one for ``taper=0``; otherwise it falls from 1 at ``(1 − taper) δ`` to
+    0 at δ as the cubic 1 − u²(3 − 2u), so value and gradient are continuous for renderers that differentiate them.
 
     Args:
         base: level 0, defined everywhere; a field, or a function of points ``(..., 3)`` → ``(...,)``.
@@ -96,16 +91,16 @@ class MultiscaleSDF(Field):
         Args:
             sizes: (width, depth) of each level.
             omegas: ω₀ of each level; the paper uses 30, 45, 100.
-            deltas: half-widths of the bands; unknown before training, by default 0.03 · 2⁻ʲ (the size the
-                paper measures, suppl. "Measured adaptive band widths").
+            deltas: half-widths of the bands; before training 0.03 · 2⁻ʲ by default, the size that the paper measures
+                (suppl. "Measured adaptive band widths").
             taper: see the class.
             in_dim: dimension of the domain.
             num_features: extra outputs of every level; they begin with unit variance.
-            residual_gain: factor on the residuals' initial output weights, so that a new level starts close to
-                the one before it.
+            residual_gain: factor on the residuals' initial output weights; a new level starts close to the one before
+                it.
 
         Raises:
-            ValueError: no sizes, or as many omegas or deltas are not given.
+            ValueError: no sizes, or the numbers of omegas or deltas differ.
         """
         if not sizes or len(omegas) != len(sizes):
             raise ValueError(f"omegas has {len(omegas)} entries for {len(sizes)} sizes; expected one for each, and ≥ 1")
@@ -132,7 +127,7 @@ class MultiscaleSDF(Field):
 
     @property
     def levels(self) -> tuple[Field, ...]:
-        """The fields that are added up, coarse to fine: the base, and the residuals after it."""
+        """The base, and the residuals after it, coarse to fine."""
         return (self.base, *self.residuals)  # pyright: ignore[reportReturnType]
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
@@ -212,7 +207,7 @@ class MultiscaleSDF(Field):
         return value, gradient, features, hessian
 
     def _gate(self, f: Tensor, delta: Tensor, order: int) -> list[Tensor]:
-        """γ and its derivatives by f up to an order of at most 2, at values f inside the band."""
+        """γ and its derivatives by f up to ``order`` ≤ 2, at values f inside the band."""
         if self.taper == 0:
             return [torch.ones_like(f), *(torch.zeros_like(f) for _ in range(order))]
         width = delta * self.taper
@@ -226,17 +221,12 @@ class MultiscaleSDF(Field):
 
 
 def levels_of(field: Field) -> tuple[Field, ...]:
-    """The levels of a `MultiscaleSDF`, coarse to fine; any other field is of one piece."""
+    """The levels of a `MultiscaleSDF`, coarse to fine; any other field is one level."""
     return field.levels if isinstance(field, MultiscaleSDF) else (field,)
 
 
 def as_levels(field: Field, level: int = -1) -> Levels:
-    """The levels of a field of SIRENs (`choose_levels`) as the fused kernels take them.
-
-    Args:
-        field: a `MultiscaleSDF`, or a `Siren`.
-        level: the finest one.
-    """
+    """The levels up to ``level`` of a `MultiscaleSDF` of SIRENs, or a `Siren`, as the fused kernels take them."""
     from ..backend.kernels.levels import Levels
     from ..backend.kernels.packing import packed
 
@@ -246,13 +236,7 @@ def as_levels(field: Field, level: int = -1) -> Levels:
 
 
 def choose_levels(levels: Sequence[Field], x: Tensor, *, jet: bool) -> Choice:
-    """How levels are to be evaluated together at points ``x``, without a graph: see `kernels.switch`.
-
-    Args:
-        levels: coarse to fine.
-        x: the points.
-        jet: gradients and features are asked for beside the values.
-    """
+    """How levels, coarse to fine, are evaluated together at points ``x`` without a graph: see `kernels.switch`."""
     networks = [level for level in levels if isinstance(level, Siren)]
     if len(networks) < len(levels):
         return Choice(False, "a level is no SIREN")
@@ -274,17 +258,11 @@ def walk_levels(
     evaluate: Callable[[Field, Tensor], Parts],
     join: Callable[[Parts, Parts, Tensor], Parts],
 ) -> Iterator[Parts]:
-    """Evaluate level after level, each one once, and only at the points that every band before it lets through.
+    """Evaluate level after level, each once, and only at the points in every band before it.
 
-    Args:
-        levels: coarse to fine; the first one is evaluated everywhere.
-        deltas: half-width δ_j of the band around each level but the last.
-        x: ``(..., d)``.
-        evaluate: a level at points ``(M, d)`` → the parts of its jet, ``(M, …)`` each, the value first.
-        join: the parts so far, those of the next level at the same points, and δ → the parts from there on.
-
-    Yields:
-        The parts ``(..., …)`` with each level in turn; outside the band before it, a level changes nothing.
+    ``evaluate`` maps a level and points ``(M, d)`` to the parts of its jet, ``(M, …)`` each, the value first. ``join``
+    maps the parts so far, those of the next level at the same points, and δ to the new parts. Yields the parts ``(...,
+    …)`` after each level; outside the band before it, a level changes nothing.
     """
 
     def shaped(parts: Parts) -> Parts:
@@ -302,10 +280,7 @@ def walk_levels(
         for level, delta in zip(levels[1:], deltas, strict=False):
             inside = inside & (parts[0].abs() < delta)
             joined = join(parts, evaluate(level, points), delta)
-            parts = tuple(
-                torch.where(inside.reshape(-1, *[1] * (new.ndim - 1)), new, part)
-                for part, new in zip(parts, joined, strict=True)
-            )
+            parts = _where(inside, joined, parts)
             yield shaped(parts)
         return
     rows = torch.arange(len(points), device=points.device)
@@ -326,7 +301,7 @@ def _walk_on(
     join: Callable[[Parts, Parts, Tensor], Parts],
     shapes: FixedShapes,
 ) -> Iterator[Parts]:
-    """The walk from the base on where shapes are fixed."""
+    """The walk from the base on inside `fixed_shapes`."""
     shapes.begin()
     count = len(points)
     inside = torch.ones_like(parts[0], dtype=torch.bool) if shapes.wanted is None else shapes.wanted
@@ -334,10 +309,7 @@ def _walk_on(
         inside, rows = shapes.admit(index, inside & (parts[0].abs() < delta))
         if rows is None:
             joined = join(parts, evaluate(level, points), delta)
-            parts = tuple(
-                torch.where(inside.reshape(-1, *[1] * (new.ndim - 1)), new, part)
-                for part, new in zip(parts, joined, strict=True)
-            )
+            parts = _where(inside, joined, parts)
         else:
             some = Rows(rows, count, full=False)  # places that are left over get the last point, and
             joined = join(tuple(map(some.of, parts)), evaluate(level, some.of(points)), delta)
@@ -348,8 +320,14 @@ def _walk_on(
         yield parts
 
 
+def _where(inside: Tensor, new: Parts, old: Parts) -> Parts:
+    """The new parts in rows that are ``inside`` ``(N,)``, the old ones elsewhere."""
+    pairs = zip(new, old, strict=True)
+    return tuple(torch.where(inside.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs)
+
+
 def _wanted() -> Tensor | None:
-    """The points that are let into bands where shapes are fixed; one launch has room for all of them."""
+    """The points that are admitted to bands inside `fixed_shapes`; one launch has capacity for all of them."""
     shapes = current_shapes()
     if shapes is None:
         return None

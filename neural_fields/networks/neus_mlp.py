@@ -1,8 +1,7 @@
 """The geometry network of NeuS (Wang et al. 2021; initialised as in SAL, Atzmon and Lipman 2020, and IDR).
 
-Eight layers of 256 softplus neurons with β = 100, weight normalisation, a positional encoding of six octaves, and the
-encoded input joined again before the middle layer. Ours differs from the published code in one thing: the
-gradient is one sweep back written in matrix products, so that it is not paid for with a second forward pass.
+Softplus layers with β = 100, weight normalisation, a positional encoding, and the encoded input joined again before the
+middle layer. Unlike the published code, the gradient is one sweep back written in matrix products.
 """
 
 from __future__ import annotations
@@ -13,11 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrizations
 
-from ..backend._checks import at_least
+from ..backend.errors import at_least
 from ..fields.field import Jet, OneLevelField
 from .radiance import encode, encoded_size
-
-__all__ = ["NeusSDF"]
 
 BETA = 100.0  # of the softplus
 
@@ -30,7 +27,7 @@ class NeusSDF(OneLevelField):
         depth: hidden layers; the encoded input is joined again before layer depth // 2.
         frequencies: octaves of the positional encoding.
         num_features: outputs beside the distance; NeuS has as many as neurons.
-        radius: of the sphere it begins as.
+        radius: of the initial sphere.
 
     Raises:
         ValueError: an argument is out of range.
@@ -44,13 +41,7 @@ class NeusSDF(OneLevelField):
     defined_by = ("width", "depth", "frequencies", "num_features")
 
     def __init__(
-        self,
-        width: int = 256,
-        depth: int = 8,
-        *,
-        frequencies: int = 6,
-        num_features: int = 256,
-        radius: float = 0.5,
+        self, width: int = 256, depth: int = 8, *, frequencies: int = 6, num_features: int = 256, radius: float = 0.5
     ) -> None:
         super().__init__()
         inputs = encoded_size(3, frequencies)

@@ -1,4 +1,4 @@
-"""Colour that depends on the direction of view, and what lies outside the region of interest (NeuS, NeRF++)."""
+"""Colour that depends on the direction of view, and a background field outside the unit sphere (NeuS, NeRF++)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import at_least
+from ..backend.errors import at_least
 from ..fields.field import Jet
 from .hash_encoding import HashEncoding
-
-__all__ = ["Outside", "Radiance", "ViewColor", "encode", "encoded_size"]
 
 
 def encode(x: Tensor, frequencies: int) -> Tensor:
@@ -23,22 +21,22 @@ def encode(x: Tensor, frequencies: int) -> Tensor:
 
 
 def encoded_size(dim: int, frequencies: int) -> int:
-    """How many numbers `encode` makes of ``dim``."""
+    """Number of outputs of `encode` for ``dim`` inputs."""
     return dim * (1 + 2 * frequencies)
 
 
 class ViewColor(nn.Module):
-    """Colour of a point of the surface as seen along a direction: NeuS's c(x, v, ∇f/|∇f|, features).
+    """Colour of a surface point as seen along a direction: NeuS's c(x, v, ∇f/|∇f|, features).
 
-    It sees the geometry only through its `Jet`, so that any field, at any level, can be under it.
+    The geometry enters only through its `Jet`, so any field, at any level, will do.
 
     Args:
         num_features: of the jet.
         width: neurons per hidden layer.
         depth: hidden layers.
         view_frequencies: octaves of the direction's encoding.
-        point_frequencies: octaves of the position's encoding; NeuS has 0 and leaves detail to the features.
-        grid: a learnt encoding of the position beside it, which becomes a part of this module; None for none.
+        point_frequencies: octaves of the position's encoding; 0 in NeuS.
+        grid: a learnt encoding of the position beside it, or None.
 
     Raises:
         ValueError: an argument is out of range.
@@ -77,10 +75,7 @@ class ViewColor(nn.Module):
         Args:
             x: ``(..., 3)`` points.
             direction: ``(..., 3)`` unit vectors, from the eye to the points.
-            jet: of the geometry there, with ``num_features`` features.
-
-        Raises:
-            ValueError: the jet has another number of features.
+            jet: of the geometry there, with ``num_features`` features; ValueError otherwise.
         """
         if jet.features.shape[-1] != self.num_features:
             raise ValueError(f"jet.features: {jet.features.shape[-1]} of them; expected {self.num_features}")
@@ -99,8 +94,7 @@ class Outside(nn.Module):
         depth: hidden layers.
         point_frequencies: octaves of the encoding of (x/r, 1/r).
         view_frequencies: octaves of the encoding of the direction.
-        grid: a learnt encoding beside that of (x/r, 1/r), which becomes a part of this module; None for none. It is
-            asked at (2 − 1/r) x/r, the ball of radius 2 into which mip-NeRF 360 contracts space.
+        grid: a learnt encoding beside it, or None; evaluated at (2 − 1/r) x/r, the contraction of mip-NeRF 360.
     """
 
     def __init__(
@@ -121,11 +115,9 @@ class Outside(nn.Module):
         self.head = nn.ModuleList(_relu_layers([width + encoded_size(3, view_frequencies), width // 2, 3]))
 
     def forward(self, inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Density ``(...,)`` ≥ 0, per unit of length, and colour ``(..., 3)`` in [0, 1].
+        """Density ``(...,)`` ≥ 0 per unit of length, and colour ``(..., 3)`` in [0, 1].
 
-        Args:
-            inverted: ``(..., 4)``, of `volume.invert_outside`.
-            direction: ``(..., 3)`` unit vectors.
+        ``inverted`` ``(..., 4)`` is from `volume.weights.invert_outside`; ``direction`` ``(..., 3)`` are unit vectors.
         """
         inputs = encode(inverted, self.point_frequencies)
         if self.grid is not None:
@@ -139,19 +131,12 @@ class Outside(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Radiance:
-    """What rays see of a geometry: with it, all that `render_volume` needs.
+    """All that `render_volume` needs beside a geometry."""
 
-    Attributes:
-        color: of the surface, by direction.
-        outside: what is outside the unit sphere; None if nothing is.
-        background: ``(3,)`` display RGB in [0, 1] behind everything.
-        inv_std: s of NeuS; 1/s is how unsure the surface is.
-    """
-
-    color: ViewColor
-    outside: Outside | None
-    background: Tensor
-    inv_std: float
+    color: ViewColor  # of the surface, by direction
+    outside: Outside | None  # field outside the unit sphere, or None
+    background: Tensor  # (3,) display RGB in [0, 1] behind everything
+    inv_std: float  # s of NeuS; 1/s is the uncertainty of the surface
 
 
 def _relu_layers(sizes: list[int]) -> list[nn.Linear]:

@@ -8,9 +8,8 @@ and, since f is a scalar, one sweep back through the same matrices gives its who
 
     g_d = w_out,   s_i = g_i ⊙ cos z_i,   g_{i-1} = s_i W_i,   ∇f = g_0.
 
-That is one matrix product per layer, as many as the value costs, where the paper's Algorithm 1 pushes three
-tangents forward and needs three more per layer. Rows are taken in blocks small enough for the
-activations of a block to stay in cache between one operation and the next.
+That is one matrix product per layer, where the paper's Algorithm 1 pushes three tangents forward. Rows are taken in
+blocks small enough for their activations to stay in cache.
 """
 
 from __future__ import annotations
@@ -23,21 +22,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import at_least, positive
-from ..backend._parallel import Step, over_blocks
-from ..backend._transforms import is_traced
+from ..backend.devices import Step, is_traced, over_blocks
+from ..backend.errors import at_least, positive
 from ..backend.kernels.switch import choose
 from ..fields.field import Jet, OneLevelField, SecondJet
 
-__all__ = ["Siren"]
-
-# Floats per activation matrix of one block: 1 MiB, so that the handful of matrices that a block needs at a time
-# fit the second- and third-level caches of current CPUs (`python -m benchmarks normals` shows the effect).
-BLOCK_FLOATS = 1 << 18
-# A GPU keeps nothing in cache between kernels; blocks only bound the memory.
-GPU_BLOCK_FLOATS = 1 << 27
-# While a graph is recorded every activation is kept anyway; larger blocks then save more calls than they lose in cache.
-GRAPH_BLOCK_FACTOR = 8
+# Floats per activation matrix of one block: 1 MiB, so that those of a block fit the second- and third-level caches of
+# CPUs (`python -m benchmarks normals`); on a GPU blocks only bound the memory.
+BLOCK_FLOATS, GPU_BLOCK_FLOATS = 1 << 18, 1 << 27
+GRAPH_BLOCK_FACTOR = 8  # larger blocks while a graph is recorded, which keeps every activation anyway
 
 
 class Siren(OneLevelField):
@@ -52,7 +45,7 @@ class Siren(OneLevelField):
         in_dim: dimension of the domain.
         num_features: extra outputs F beside the value, returned in ``Jet.features``.
         output_gain: factor on the initial output weights; a residual starts small with 0.1.
-        feature_gain: the same for the features; with ω₀ they begin with unit variance, as who reads them expects.
+        feature_gain: the same for the features; with ω₀ they begin with unit variance.
 
     Attributes:
         units: of the sine layers' parameters and of the output's; see `set_units`.
@@ -107,18 +100,17 @@ class Siren(OneLevelField):
 
     @torch.no_grad()
     def set_units(self, sines: float = 1.0, output: float = 1.0) -> None:
-        """Keep the parameters in other units: their numbers change, the function and its jets do not, not by one bit.
+        """Keep the parameters in other units: their numbers change, the function and its jets do not, bit for bit.
 
         A weight W is stored as W / unit. Adam moves a stored number by the learning rate, and so W by unit times as
-        much: layers that want different rates can be trained with one. State dicts hold W under its own name, whatever
-        the units, so that any of them fits any other.
+        much: layers that want different rates can share one. State dicts hold W, whatever the units.
 
         Args:
-            sines: of the sine layers' weights and biases.
-            output: of those of the output.
+            sines: unit of the sine layers' weights and biases, a power of two.
+            output: unit of the output's.
 
         Raises:
-            ValueError: a unit is not a power of two, with which nothing is rounded.
+            ValueError: a unit is not a power of two, so that numbers would be rounded.
         """
         for name, unit in (("sines", sines), ("output", output)):
             if not 0 < unit < math.inf or math.frexp(unit)[0] != 0.5:
@@ -171,20 +163,17 @@ class Siren(OneLevelField):
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; the gradient comes from one reverse sweep of matrix products, without autograd.
 
-        Differentiable any number of times with respect to ``x`` and the parameters; the first derivative
-        (what eikonal and normal losses need) is written out by hand and costs four more passes.
+        Differentiable any number of times with respect to ``x`` and the parameters; the first derivative is written out
+        by hand and costs four more passes.
         """
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
         if is_traced():
             output, gradients = plain_jet(rows, self.folded(), 1)
-            shape = x.shape[:-1]
-            features = output[:, 1:].reshape(*shape, self.num_features)
-            return Jet(output[:, 0].reshape(shape), gradients[:, 0].reshape(x.shape), features)
+            return _shaped(x, output, gradients[:, 0])
         if choose(rows, width=self.width, depth=self.depth, features=self.num_features).fused:
             value, gradient = self._fused_jet(rows)
-            shape = x.shape[:-1]
-            return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
+            return _shaped(x, value[:, None], gradient)
         parameters = self.folded()
         if needs_graph(rows, parameters):
             size = GRAPH_BLOCK_FACTOR * self.block_rows(rows.device)
@@ -199,9 +188,7 @@ class Siren(OneLevelField):
                 return lambda part: _jet_into(output[part], gradient[part], rows[part], parameters, buffers)
 
             over_blocks(len(rows), self.block_rows(rows.device), prepare, like=rows)
-        shape = x.shape[:-1]
-        features = output[:, 1:].reshape(*shape, self.num_features)
-        return Jet(output[:, 0].reshape(shape), gradient.reshape(x.shape), features)
+        return _shaped(x, output, gradient)
 
     def _fused_jet(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Value and gradient by the fused kernels, on the graph if one is recorded."""
@@ -216,8 +203,8 @@ class Siren(OneLevelField):
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
         """See `Field.second_jet`; one tangent forward for each of the ``dims`` coordinates, without autograd.
 
-        With ∂z_i/∂x_a the tangents of the pre-activations and g_i the sweep back, only the bending of the sines
-        contributes: ∂²f/∂x_a∂x_b = −Σ_i ⟨g_i ⊙ sin z_i, ∂z_i/∂x_a ⊙ ∂z_i/∂x_b⟩.
+        With ∂z_i/∂x_a the tangents of the pre-activations and g_i the sweep back,
+        ∂²f/∂x_a∂x_b = −Σ_i ⟨g_i ⊙ sin z_i, ∂z_i/∂x_a ⊙ ∂z_i/∂x_b⟩.
         """
         self.resolve_level(level)
         dims = self.resolve_dims(dims)
@@ -226,21 +213,10 @@ class Siren(OneLevelField):
         size = self.block_rows(rows.device) * (GRAPH_BLOCK_FACTOR if needs_graph(rows, parameters) else 1)
         parts = [_plain_second_jet(part, parameters, dims) for part in rows.split(size)]
         output, gradient, hessian = (torch.cat(part) for part in zip(*parts, strict=True))
-        shape = x.shape[:-1]
-        return SecondJet(
-            output[:, 0].reshape(shape),
-            gradient.reshape(x.shape),
-            output[:, 1:].reshape(*shape, self.num_features),
-            hessian.reshape(*shape, dims, dims),
-        )
+        return SecondJet(*_shaped(x, output, gradient), hessian.reshape(*x.shape[:-1], dims, dims))
 
     def check_points(self, x: Tensor) -> Tensor:
-        """See `Field.check_points`.
-
-        Raises:
-            ValueError: the shape or the device is another than this network's.
-            TypeError: it is no tensor, or of another precision.
-        """
+        """See `Field.check_points`; ValueError too for another device, TypeError for another precision."""
         super().check_points(x)
         like = self.output.weight
         if x.device != like.device:
@@ -254,7 +230,7 @@ class Siren(OneLevelField):
         return fold(self.raw(), self.omega * self.units[0], self.units[1])
 
     def raw(self) -> list[Tensor]:
-        """Weights and biases as they are kept: [W_1, b_1, …, W_out, b_out]."""
+        """Weights and biases as they are stored: [W_1, b_1, …, W_out, b_out]."""
         return [part for layer in (*self._sine_layers(), self.output) for part in (layer.weight, layer.bias)]
 
     def _sine_layers(self) -> Iterator[nn.Linear]:
@@ -263,8 +239,15 @@ class Siren(OneLevelField):
             yield layer
 
     def block_rows(self, device: torch.device) -> int:
-        """How many rows one block holds on ``device``."""
+        """Rows of one block on ``device``."""
         return _block_rows(self.width, device)
+
+
+def _shaped(x: Tensor, output: Tensor, gradient: Tensor) -> Jet:
+    """The jet at ``x`` ``(..., d)`` from outputs ``(N, 1 + F)`` and gradients ``(N, d)``."""
+    shape = x.shape[:-1]
+    features = output[:, 1:].reshape(*shape, output.shape[1] - 1)
+    return Jet(output[:, 0].reshape(shape), gradient.reshape(x.shape), features)
 
 
 def _block_rows(width: int, device: torch.device) -> int:
@@ -281,6 +264,7 @@ def fold(parameters: Sequence[Tensor], frequency: float, out: float) -> list[Ten
 
 
 def needs_graph(x: Tensor, parameters: Sequence[Tensor]) -> bool:
+    """Whether autograd records an evaluation at ``x`` with these parameters."""
     return torch.is_grad_enabled() and (x.requires_grad or any(p.requires_grad for p in parameters))
 
 
@@ -297,7 +281,7 @@ def forward(x: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, list[Tenso
 def plain_jet(x: Tensor, parameters: Sequence[Tensor], channels: int) -> tuple[Tensor, Tensor]:
     """Outputs, and the Jacobian ``(N, channels, d)`` of the first of them, by sweeps back that are rows of one matrix.
 
-    In plain operations, which autograd can differentiate as often as it is asked.
+    In plain operations, which autograd can differentiate any number of times.
     """
     output, _, phases = forward(x, parameters)
     g = parameters[-2][:channels].expand(len(x), -1, -1)  # (N, channels, width)
@@ -331,21 +315,21 @@ def _plain_second_jet(x: Tensor, parameters: Sequence[Tensor], dims: int) -> tup
 
 
 def _without_units(siren: Siren, state: dict[str, Any], prefix: str, metadata: object) -> None:
-    """Put the weights themselves into a state dict."""
+    """Put the weights W themselves into a state dict."""
     for name, unit in siren._unit_of_each():
         if unit != 1:
             state[prefix + name] = state[prefix + name] * unit
 
 
 def _into_units(siren: Siren, state: dict[str, Any], prefix: str, *_: object) -> None:
-    """Take the weights of a state dict into the units of this network."""
+    """Convert the weights of a state dict to the units of this network."""
     for name, unit in siren._unit_of_each():
         if unit != 1 and prefix + name in state:
             state[prefix + name] = state[prefix + name] / unit
 
 
 def _outputs_into(output: Tensor, x: Tensor, parameters: Sequence[Tensor], buffers: Sequence[Tensor]) -> None:
-    """Write the first outputs of one block into ``output`` ``(N, channels)``, ping-ponging between two buffers."""
+    """Write the first outputs of one block into ``output`` ``(N, channels)``, alternating between two buffers."""
     h, channels = x, output.shape[1]
     for index in range(len(parameters) // 2 - 1):
         z = buffers[index % 2][: len(x)]
@@ -381,10 +365,10 @@ def _jet_into(
 class _SirenJet(torch.autograd.Function):
     """Outputs and gradient of a SIREN, with the derivative of both written out.
 
-    Let ō and ḡ be the cotangents of outputs and gradient. The reverse sweep is linear in ḡ, so its
-    adjoint is one forward sweep of a single tangent, u_0 = ḡ, u_i = (u_{i-1} W_iᵀ) ⊙ cos z_i; the
-    value's adjoint is the usual backward pass, which picks up −(u_{i-1} W_iᵀ) ⊙ g_i ⊙ sin z_i on the way.
-    Both halves of a weight's gradient, s_iᵀ u_{i-1} and z̄_iᵀ h_{i-1}, are accumulated in one buffer.
+    Let ō and ḡ be the cotangents of outputs and gradient. The reverse sweep is linear in ḡ, so its adjoint is one
+    forward sweep of a single tangent, u_0 = ḡ, u_i = (u_{i-1} W_iᵀ) ⊙ cos z_i; the value's adjoint is the usual
+    backward pass, which picks up −(u_{i-1} W_iᵀ) ⊙ g_i ⊙ sin z_i on the way. Both halves of a weight's gradient, s_iᵀ
+    u_{i-1} and z̄_iᵀ h_{i-1}, are accumulated in one buffer.
     """
 
     @staticmethod
@@ -419,7 +403,10 @@ class _SirenJet(torch.autograd.Function):
         x, depth = saved[0], len(ctx.needs_input_grad) // 2 - 1
         parameters = saved[1 : 2 * depth + 3]
         if torch.is_grad_enabled():
-            return _differentiable_backward(ctx.needs_input_grad, x, parameters, cotangents)
+            output, jacobian = plain_jet(x, parameters, 1)
+            return _differentiable_backward(
+                ctx.needs_input_grad, (x, *parameters), (output, jacobian[:, 0]), cotangents
+            )
         kept = saved[2 * depth + 3 :]
         output_bar, gradient_bar = cotangents
         # Autograd materialises the cotangents nobody asked for.
@@ -459,7 +446,7 @@ def _add_bars(
     parameters: Sequence[Tensor],
     buffers: Sequence[Tensor],
 ) -> None:
-    """Add what one block gives to the cotangents of the parameters, and write those of its points."""
+    """Add one block's share to the cotangents of the parameters, and write those of its points."""
     output_bar, gradient_bar, x = rows[:3]
     depth = len(parameters) // 2 - 1
     sines, cosines, s_rows, g_rows = (rows[3 + i * depth : 3 + (i + 1) * depth] for i in range(4))
@@ -490,15 +477,12 @@ def _add_bars(
 
 
 class _FusedJet(torch.autograd.Function):
-    """Value and gradient of a SIREN of one output by a fused kernel, and the way back by another, in IEEE float32.
-
-    Parameters are those that the module keeps; ω₀ is multiplied in the kernels.
-    """
+    """Value and gradient of a SIREN of one output, and its backward pass, by fused kernels in IEEE float32."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, omega: float, gain: float, *parameters: Tensor) -> tuple[Tensor, Tensor]:
-        from ..backend.kernels.ieee import jet
         from ..backend.kernels.launch import Network
+        from ..backend.kernels.training import jet
 
         ctx.numbers = omega, gain
         ctx.save_for_backward(x, *parameters)
@@ -514,26 +498,19 @@ class _FusedJet(torch.autograd.Function):
         assert value_bar is not None
         assert gradient_bar is not None
         if torch.is_grad_enabled():
-            # Who differentiates once more gets plain operations.
             needed = [ctx.needs_input_grad[0], *ctx.needs_input_grad[3:]]
-            wanted = [tensor for tensor, need in zip((x, *parameters), needed, strict=True) if need]
             output, jacobian = plain_jet(x, fold(parameters, omega, gain), 1)
-            outputs, bars = (output[:, 0], jacobian[:, 0]), (value_bar, gradient_bar)
-            found = iter(torch.autograd.grad(outputs, wanted, bars, create_graph=True, materialize_grads=True))
-            x_bar, *own = (next(found) if need else None for need in needed)
+            outputs = output[:, 0], jacobian[:, 0]
+            x_bar, *own = _differentiable_backward(needed, (x, *parameters), outputs, cotangents)
         else:
             x_bar, own = jet_backward(x, Network.of(parameters, omega, gain), value_bar, gradient_bar)
         return x_bar, None, None, *own
 
 
 def _differentiable_backward(
-    needed: Sequence[bool], x: Tensor, parameters: Sequence[Tensor], cotangents: Sequence[Tensor | None]
+    needed: Sequence[bool], inputs: Sequence[Tensor], outputs: Sequence[Tensor], cotangents: Sequence[Tensor | None]
 ) -> tuple[Tensor | None, ...]:
-    """The backward pass in plain operations, for whoever differentiates it again (``create_graph=True``)."""
-    inputs = [x, *parameters]
+    """Cotangents of the inputs that need one, by autograd, which can differentiate them again."""
     wanted = [tensor for tensor, need in zip(inputs, needed, strict=True) if need]
-    output, jacobian = plain_jet(x, parameters, 1)
-    found = iter(
-        torch.autograd.grad((output, jacobian[:, 0]), wanted, cotangents, create_graph=True, materialize_grads=True)
-    )
+    found = iter(torch.autograd.grad(outputs, wanted, cotangents, create_graph=True, materialize_grads=True))
     return tuple(next(found) if need else None for need in needed)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import positive
+from ..backend.errors import positive
 from ..fields.losses import data_loss, eikonal_loss, normal_loss
 from .siren import Siren, forward
-
-__all__ = ["fit_sphere", "solve_sphere"]
 
 TRAINED_RADIUS = 1.05  # how far out it is trained: a little further than the unit sphere
 
@@ -17,10 +15,9 @@ TRAINED_RADIUS = 1.05  # how far out it is trained: a little further than the un
 def fit_sphere(
     network: Siren, radius: float = 0.5, *, steps: int = 200, batch: int = 1024, learning_rate: float = 3e-3
 ) -> None:
-    """Train a SIREN in place to |x| − radius on the unit ball, for training from images.
+    """Train a SIREN in place to |x| − radius on the unit ball, for training from images; a few seconds on a CPU.
 
-    A few seconds on a CPU. torch's random state is used; units stay as they were. The weights are small enough for
-    hosts without a warm-up.
+    torch's random state is used; units stay as they were. The weights are small enough for hosts without a warm-up.
 
     Args:
         network: the coarse level.
@@ -56,37 +53,16 @@ def fit_sphere(
 def solve_sphere(
     network: Siren, radius: float = 0.5, *, phase: float = 1.7, slope_weight: float = 0.1, ridge: float = 1e-6
 ) -> None:
-    """Begin as |x| − radius on the unit ball, by one linear solve: a fit in place of `fit_sphere`'s training.
+    """Initialise as |x| − radius on the unit ball by one linear solve, instead of the training of `fit_sphere`.
 
-    The first layer is turned down to phases of at most ``phase`` per coordinate, the layers after it stay as they were
-    drawn, and the output's weights w and bias b for the value are those of least
+    The first layer is scaled to phases of at most ``phase`` per coordinate: higher ones fit the sphere worse, much
+    lower ones need large weights that cancel. The output's weights w and bias b minimise
 
         Σ (w·h(x) + b − |x| + r)² + slope_weight |Jᵀw − x / |x||² + ridge n |w|²
 
     over n points in the ball, h being the last sines and J their Jacobian. (128, 4) at ω₀ = 10 is then off by 0.01, and
     its slopes by 0.1 (root mean squares). No random numbers are drawn; features stay as they were. The output's weights
-    are seven times those of `fit_sphere`, and cancel, so use it only for trainings that warm up slowly.
-
-    Args:
-        network: untrained; the coarse level.
-        radius: of the sphere.
-        phase: largest one per coordinate in the first layer. Higher ones fit the smooth sphere worse; much lower ones
-            better, but by large weights that cancel, which the first steps of a training break.
-        slope_weight: of squared slopes, beside squared distances.
-        ridge: in mean squares of a sine.
-
-    Raises:
-        ValueError: the radius is not positive.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Siren
-        >>> from mplicits.neural_fields.networks.sphere_init import solve_sphere
-        >>> _ = torch.manual_seed(0)
-        >>> siren = Siren(128, 4, omega=10.0)
-        >>> solve_sphere(siren, radius=0.4)
-        >>> bool((siren.value(0.4 * torch.eye(3)).abs() < 0.05).all())
-        True
+    are seven times those of `fit_sphere`, so use it only for trainings that warm up slowly.
     """
     positive(radius=radius)
     units = network.units

@@ -1,12 +1,9 @@
 """Colour as a field over the band around a surface: the paper's texture network g (Sec. 3, "Texture mapping").
 
-With ω₀ folded in as in `siren`, the three outputs of a SIREN and their derivative along a direction v come from
-one pass of one tangent, two matrix products per layer and no automatic differentiation:
+With ω₀ folded in as in `siren`, colour and its derivative along a direction v come from one pass of one tangent:
 
     z_i = W_i h_{i-1} + b_i,   h_i = sin z_i,           h_0 = x,   g(x) = W_out h_d + b_out
                                u_i = (W_i u_{i-1}) ⊙ cos z_i,   u_0 = v,   ∇g(x) v = W_out u_d
-
-The whole Jacobian is three sweeps back, one per channel, made as a single product per layer.
 """
 
 from __future__ import annotations
@@ -16,43 +13,19 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import positive
+from ..backend.errors import positive
 from ..fields.field import Field, Jet, OneLevelField
 from .siren import Siren, forward, needs_graph, plain_jet
-
-__all__ = ["ColorSiren", "TextureField"]
 
 
 class ColorSiren(nn.Module):
     """A SIREN with three outputs, defined everywhere and not limited to [0, 1].
 
-    Args:
-        width: neurons in each sine layer.
-        depth: number of sine layers, at least 1.
-        omega: the frequency ω₀ of Eq. 2; textures have finer detail than shapes.
-        in_dim: dimension of the domain.
-        mean: RGB that the untrained network gives nearly everywhere.
-
-    Raises:
-        ValueError: an argument is out of range.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields.networks.texture import ColorSiren
-        >>> network = ColorSiren(256, 3)
-        >>> value, along = network.derivative_along(torch.zeros(5, 3), torch.ones(5, 3))
-        >>> value.shape, along.shape
-        (torch.Size([5, 3]), torch.Size([5, 3]))
+    ``omega`` is ω₀ of Eq. 2, higher than for shapes; ``mean`` the RGB of the untrained network nearly everywhere.
     """
 
     def __init__(
-        self,
-        width: int,
-        depth: int,
-        *,
-        omega: float = 60.0,
-        in_dim: int = 3,
-        mean: Sequence[float] = (0.5, 0.5, 0.5),
+        self, width: int, depth: int, *, omega: float = 60.0, in_dim: int = 3, mean: Sequence[float] = (0.5, 0.5, 0.5)
     ) -> None:
         super().__init__()
         self.siren = Siren(width, depth, omega=omega, in_dim=in_dim, num_features=2)
@@ -63,11 +36,8 @@ class ColorSiren(nn.Module):
         """Colours at ``x`` ``(..., d)`` → ``(..., 3)``."""
         rows = self._rows(x)
         parameters = self.siren.folded()
-        if needs_graph(rows, parameters):
-            value = forward(rows, parameters)[0]
-        else:
-            value = torch.cat([_value_in_place(part, parameters) for part in self._blocks(rows)])
-        return value.reshape(*x.shape[:-1], 3)
+        blocks = [rows] if needs_graph(rows, parameters) else self._blocks(rows)
+        return torch.cat([forward(part, parameters)[0] for part in blocks]).reshape(*x.shape[:-1], 3)
 
     def jet(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Colours ``(..., 3)`` and their Jacobian ``(..., 3, d)`` at ``x`` ``(..., d)``, by sweeps back."""
@@ -79,28 +49,20 @@ class ColorSiren(nn.Module):
         return torch.cat(values).reshape(shape), torch.cat(gradients).reshape(*shape, x.shape[-1])
 
     def derivative_along(self, x: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours, and their derivative ``∇g(x) v`` along ``v``, by one tangent forward.
+        """Colours and their derivative ``∇g(x) v``, both ``(..., 3)``, by one tangent forward.
 
-        Args:
-            x: ``(..., d)``.
-            direction: ``(..., d)``, the v of each point; need not be of unit length.
-
-        Returns:
-            Both ``(..., 3)``, differentiable with respect to parameters, ``x`` and ``direction``.
-
-        Raises:
-            ValueError: the shapes differ.
+        ``x`` and the directions v, of any length, are ``(..., d)``. Differentiable by parameters, ``x`` and
+        ``direction``.
         """
         if direction.shape != x.shape:
             raise ValueError(f"direction has shape {tuple(direction.shape)}; expected that of x, {tuple(x.shape)}")
         rows, tangents = self._rows(x), self._rows(direction)
         parameters = self.siren.folded()
-        if needs_graph(rows, [tangents, *parameters]):
-            value, derivative = _tangent(rows, tangents, parameters)
-        else:
+        pairs = [(rows, tangents)]
+        if not needs_graph(rows, [tangents, *parameters]):
             pairs = zip(self._blocks(rows), self._blocks(tangents), strict=True)
-            parts = [_tangent_in_place(part, along, parameters) for part, along in pairs]
-            value, derivative = (torch.cat(both) for both in zip(*parts, strict=True))
+        parts = [_tangent(part, along, parameters) for part, along in pairs]
+        value, derivative = (torch.cat(both) for both in zip(*parts, strict=True))
         shape = (*x.shape[:-1], 3)
         return value.reshape(shape), derivative.reshape(shape)
 
@@ -115,15 +77,14 @@ class ColorSiren(nn.Module):
 class TextureField(OneLevelField):
     """RGB in the band ``|f| < δ`` around a surface, a constant colour elsewhere.
 
-    Colours are display numbers (sRGB-encoded) in [0, 1]: the network's output is clamped. Points outside the band
-    are gathered away before the network sees them. Whether a point is inside costs one value of the geometry;
-    who knows that it is (traced hits, samples) calls `colors`, which does not ask.
+    Colours are display numbers (sRGB-encoded) in [0, 1]: the network's output is clamped. Points outside the band are
+    gathered away before the network is evaluated, for one value of the geometry per point; `colors` skips that test.
 
     Args:
-        geometry: the field f whose surface has the colours; only evaluated, never trained here.
+        geometry: the field f whose surface has the colours; evaluated only, never trained here.
         network: g.
         delta: half-width δ of the band, in units of the field.
-        geometry_level: the level of the geometry that is meant.
+        geometry_level: the level of the geometry.
         outside: RGB outside the band.
 
     Raises:
@@ -162,7 +123,7 @@ class TextureField(OneLevelField):
         self.outside: Tensor
 
     def colors(self, x: Tensor) -> Tensor:
-        """Colours at ``x`` ``(..., d)`` → ``(..., 3)``, in the band or not: the geometry is not asked."""
+        """Colours at ``x`` ``(..., d)`` → ``(..., 3)``, in the band or not; the geometry is not evaluated."""
         return self.network.value(x).clamp(0, 1)
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
@@ -182,11 +143,7 @@ class TextureField(OneLevelField):
         return Jet(value.reshape(shape), gradient.reshape(*shape, self.in_dim), x.new_empty((*x.shape[:-1], 0)))
 
     def derivative_along(self, x: Tensor, direction: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
-        """Colours and their derivative along ``direction``, both ``(..., 3)``: see `ColorSiren.derivative_along`.
-
-        Raises:
-            ValueError: the shapes of ``x`` and ``direction`` differ.
-        """
+        """Colours and their derivative along ``direction``, both ``(..., 3)``: see `ColorSiren.derivative_along`."""
         rows, inside = self._inside(x, level)
         if direction.shape != x.shape:
             raise ValueError(f"direction has shape {tuple(direction.shape)}; expected that of x, {tuple(x.shape)}")
@@ -216,28 +173,10 @@ def _unclamped(raw: Tensor) -> Tensor:
     return ((raw >= 0) & (raw <= 1)).to(raw.dtype)
 
 
-def _value_in_place(x: Tensor, parameters: Sequence[Tensor]) -> Tensor:
-    """Outputs of one block, each sine over its phase."""
-    h = x
-    for weight, bias in zip(parameters[0:-2:2], parameters[1:-2:2], strict=True):
-        h = torch.addmm(bias, h, weight.t()).sin_()
-    return torch.addmm(parameters[-1], h, parameters[-2].t())
-
-
 def _tangent(x: Tensor, v: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Outputs and derivative along ``v``, both ``(N, 3)``, in operations that autograd can differentiate."""
     h, u = x, v
     for weight, bias in zip(parameters[0:-2:2], parameters[1:-2:2], strict=True):
         z = torch.addmm(bias, h, weight.t())
         h, u = z.sin(), (u @ weight.t()) * z.cos()
-    return torch.addmm(parameters[-1], h, parameters[-2].t()), u @ parameters[-2].t()
-
-
-def _tangent_in_place(x: Tensor, v: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """`_tangent` of one block that stays in cache."""
-    h, u = x, v
-    for weight, bias in zip(parameters[0:-2:2], parameters[1:-2:2], strict=True):
-        z = torch.addmm(bias, h, weight.t())
-        u = (u @ weight.t()).mul_(z.cos())
-        h = z.sin_()
     return torch.addmm(parameters[-1], h, parameters[-2].t()), u @ parameters[-2].t()

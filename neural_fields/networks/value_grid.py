@@ -1,48 +1,26 @@
-"""Values of a field on the vertices of a grid, kept while the field is trained: to find its surface without a network.
-
-A renderer in training asks a level for its values at tens of points per ray, only to learn where its surface is. That
-surface moves little from step to step, so values from a few steps ago, interpolated, say it as well.
-"""
+"""Values of a field on the vertices of a grid, kept while the field is trained, to find its surface cheaply."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from ..backend._checks import at_least, positive
+from ..backend.errors import at_least, positive
 from ..fields.field import Field
-
-__all__ = ["ValueGrid"]
 
 
 class ValueGrid:
     """A level's values at (resolution + 1)³ vertices of the cube [−1, 1]³, trilinear in between.
 
-    For a field whose second derivatives along lines are at most K, the interpolation is off by 3/8 K h² at most, with
-    the edge h = 2 / resolution; to that comes how far the field has moved since `refresh`.
-
-    Args:
-        resolution: cells along an edge.
-        device: where the values are kept.
-        reach: `refresh` of the near part evaluates the vertices whose kept value is at most this far from 0; it may be
-            changed, and should not be below the diagonal of a cell, or some beside the surface are left out.
+    For second derivatives along lines of at most K the interpolation is off by 3/8 K h², h = 2 / resolution, plus the
+    field's change since `refresh`.
 
     Attributes:
-        kept: ``(resolution + 1, resolution + 1, resolution + 1)`` values, by x, y and z; 1 where none was asked for.
-        moved: 0-d, by how much `refresh` has last changed the values that were at most ``reach`` from 0: the root mean
-            square; ∞ if there were none.
-
-    Raises:
-        ValueError: a number is out of range.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Sphere
-        >>> from mplicits.neural_fields.networks.value_grid import ValueGrid
-        >>> grid = ValueGrid(32)
-        >>> grid.refresh(Sphere(radius=0.5))
-        >>> bool((grid(torch.tensor([[0.3, 0.4, 0.2]])) - (0.29**0.5 - 0.5)).abs() < 0.01)
-        True
+        reach: a partial `refresh` evaluates vertices whose value is at most this far from 0; at least a cell's
+            diagonal.
+        kept: ``(resolution + 1, resolution + 1, resolution + 1)`` values, by x, y and z; 1 where none was evaluated.
+        moved: 0-d, root mean square change of the values within ``reach`` of 0 by the last `refresh`; ∞ if there were
+            none.
     """
 
     def __init__(self, resolution: int = 64, device: torch.device | None = None, *, reach: float = 0.15) -> None:
@@ -55,13 +33,9 @@ class ValueGrid:
 
     @torch.no_grad()
     def refresh(self, field: Field, *, level: int = 0, whole: bool = True) -> None:
-        """Evaluate a level of a field at the vertices again.
+        """Evaluate a level of a field, in unit-sphere coordinates, at the vertices again.
 
-        Args:
-            field: in unit-sphere coordinates.
-            level: of the field.
-            whole: at all vertices that a point of the unit ball can ask for; otherwise only at those near the kept
-                surface.
+        If ``whole``, at all vertices of cells in the unit ball; otherwise only near the kept surface.
         """
         near = self.kept.abs() <= self.reach
         edge = 2 / self.resolution

@@ -1,22 +1,20 @@
-"""Tracing surfaces that move: one frame says what the next ones need not look for.
+"""Tracing surfaces that move, with what one frame shows about the next ones.
 
-**Key frames** are traced as from scratch, and note for every ray where it comes within ``reach`` of the surface. Until
-the surface may have moved that far, the frames in between
+**Key frames** are traced from scratch (`sphere_trace`), and record for every ray where it comes within ``reach`` of the
+surface. Until the surface may have moved that far, the frames in between
 
-- leave out rays that came nowhere near it,
+- leave out rays that never came near it,
 - begin the others where they came near, and end those that passed where they left it again,
-- start at a ray's expected hit, from its depths in the last two frames, if the key frame saw the field fall evenly to
-  the hit.
+- start at a ray's expected hit, from its depths in the last two frames, if the key frame saw an even fall to the hit.
 
-Key frames are those of `sphere_trace`, however far the surface has moved. Frames in between rest on the ``speed``, a
-bound on |∂f/∂t|: a point with f ≥ reach stays outside for ``reach / speed``. They miss what grows out of the last
-stretch of an even fall, and a spike between two clear samples of a ray, until the next key frame. With ``reach=0``
-every frame is a key frame.
+These rest on the ``speed``, a bound on |∂f/∂t|: a point with f ≥ reach stays outside for ``reach / speed``. Until the
+next key frame they miss what grows out of the last stretch of an even fall, and a spike between two clear samples of a
+ray.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,68 +24,51 @@ from ..tracing.cones import CONE_LIPSCHITZ, cone_ends, cone_starts
 from ..tracing.sphere import BOUNDING_RADIUS, Expected, Hits, Near, ball_points, trace_expected
 from .field import SpaceTimeSDF, TimeSlice, check_spacetime
 
-__all__ = ["DynamicTracer", "moment"]
-
 
 def moment(field: Field, t: float) -> Field:
-    """The three-dimensional field at a time: `SpaceTimeSDF.at`, where a point costs least, or else a `TimeSlice`.
+    """The three-dimensional field at a time: `SpaceTimeSDF.at`, the cheapest, or else a `TimeSlice`.
 
-    Raises:
-        ValueError: the field is not four-dimensional.
+    ValueError if the field is not four-dimensional.
     """
     return field.at(t) if isinstance(field, SpaceTimeSDF) else TimeSlice(field, t)
 
 
 class _Frame(NamedTuple):
-    """What is kept of a frame.
-
-    Attributes:
-        time: when.
-        depth: of the hits, infinite where there are none.
-        slope: how fast the field fell along the rays there.
-    """
+    """A frame that was traced."""
 
     time: float
-    depth: Tensor
-    slope: Tensor
+    depth: Tensor  # of hits, infinite elsewhere
+    slope: Tensor  # how fast the field fell along the rays there
 
 
 class _Key(NamedTuple):
-    """What is kept of a key frame.
-
-    Attributes:
-        time: when.
-        lasts: how long the surface takes to move by the reach.
-        near: where each ray came near the surface.
-        far: where to give up: where rays that missed had left it again.
-    """
+    """A key frame."""
 
     time: float
-    lasts: float
-    near: Near
-    far: Tensor
+    lasts: float  # time in which the surface moves by the reach
+    near: Near  # where each ray came near the surface
+    far: Tensor  # where to stop: where rays that missed had left it again
 
 
 class DynamicTracer:
-    """First intersections of the same rays with a surface that moves, frame after frame.
+    """First intersections of the same rays with a moving surface, frame after frame; see the module.
 
-    Times may come in any order and at any distance; the nearer, the more frames there are between two key frames (see
-    the module for what these are, and what holds).
+    Times may come in any order and distance; the nearer, the more frames there are between two key frames.
 
     Args:
         field: four-dimensional.
         origins: ``(3,)`` or ``(..., 3)``.
-        directions: ``(..., 3)`` of unit length. The rays ``(H, W, 3)`` of an image with one origin are traced in tiles
-            first, as far as whole tiles see nothing.
+        directions: ``(..., 3)`` of unit length. Rays ``(H, W, 3)`` of an image with one origin are traced in tiles
+            first.
         level: whose surface to find.
         tolerance: see `sphere_trace`.
         resolution: see `sphere_trace`.
         lipschitz: see `sphere_trace`.
         radius: see `sphere_trace`.
-        reach: how near to the surface is near; by default 12 resolutions. More makes key frames fewer and the others
-            dearer; 0 makes every frame a key frame.
-        speed: bound on |∂f/∂t| near the surface; by default a quarter more than the largest one that is measured, for
-            every key frame, at points all around it.
+        reach: distance that is near; by default 12 resolutions. More makes key frames fewer and other frames dearer;
+            with 0 every frame is a key frame.
+        speed: bound on |∂f/∂t| near the surface; by default 1.25 times the largest measured around it at every key
+            frame.
 
     Raises:
         ValueError: the field is not four-dimensional, has no such level, or a number is negative.
@@ -121,19 +102,16 @@ class DynamicTracer:
             if number is not None and number < 0:
                 raise ValueError(f"{name}={number}: expected ≥ 0")
         self.field, self.origins, self.directions = field, origins, directions
-        self.level, self.radius = field.resolve_level(level), radius
-        self.tolerance, self.resolution, self.lipschitz = tolerance, resolution, lipschitz
+        self.level, self.lipschitz, self.radius = field.resolve_level(level), lipschitz, radius
+        self.settings: dict[str, Any] = {"level": self.level, "lipschitz": lipschitz, "radius": radius}
+        self.settings |= {"tolerance": tolerance, "resolution": resolution}
         self.reach, self.speed = 12.0 * resolution if reach is None else reach, speed
         self._frames: list[_Frame] = []
         self._key: _Key | None = None
 
     @torch.no_grad()
     def trace(self, t: float) -> Hits:
-        """The hits at a time.
-
-        Raises:
-            ValueError: see `sphere_trace`.
-        """
+        """The hits at a time; errors are those of `sphere_trace`."""
         field, key = moment(self.field, t), self._key
         if key is not None and abs(t - key.time) < key.lasts:
             hits, slope, _ = self._trace(field, self._expected(t, key.near.value), key.near.clear, key.far, None)
@@ -143,7 +121,7 @@ class DynamicTracer:
         return hits
 
     def _trace_key(self, field: Field, t: float) -> tuple[Hits, Tensor]:
-        """A key frame."""
+        """Trace a key frame."""
         start, end = self._tiles(field)
         unknown = torch.full_like(self.directions[..., 0], torch.inf)
         hits, slope, near = self._trace(field, self._expected(t, unknown), start, end, self.reach)
@@ -157,23 +135,11 @@ class DynamicTracer:
     def _trace(
         self, field: Field, expected: Expected | None, near: Tensor | float, far: Tensor | float, reach: float | None
     ) -> tuple[Hits, Tensor, Near]:
-        return trace_expected(
-            field,
-            self.origins,
-            self.directions,
-            expected,
-            level=self.level,
-            near=near,
-            far=far,
-            radius=self.radius,
-            tolerance=self.tolerance,
-            resolution=self.resolution,
-            lipschitz=self.lipschitz,
-            reach=reach,
-        )
+        rays = self.origins, self.directions
+        return trace_expected(field, *rays, expected, near=near, far=far, reach=reach, **self.settings)
 
     def _measured_speed(self, t: float) -> float:
-        """How fast values change at this time near the surface; of a distance, that is how fast the surface moves."""
+        """Largest |∂f/∂t| near the surface now, with a margin; for a distance, how fast the surface moves."""
         interval, near, margin = 1e-3, 0.1, 1.25  # of time; of the surface; a quarter more than was measured
         generator = torch.Generator().manual_seed(0)
         points = ball_points(16384, radius=self.radius, generator=generator).to(self.directions)
@@ -183,7 +149,7 @@ class DynamicTracer:
         return margin * float((rate[close] if close.any() else rate).max())
 
     def _tiles(self, field: Field) -> tuple[Tensor | float, Tensor | float]:
-        """Between which depths something may be near, as far as tiles can tell."""
+        """Depths between which something may be near, as far as tiles show."""
         if self.origins.shape != (3,) or self.directions.ndim != 3:
             return 0.0, torch.inf
         cones = {"level": self.level, "lipschitz": CONE_LIPSCHITZ * self.lipschitz, "radius": self.radius}
@@ -194,7 +160,7 @@ class DynamicTracer:
         return near, cone_ends(field, self.origins, self.directions, passing, clearance=self.reach, **cones)
 
     def _expected(self, t: float, value: Tensor) -> Expected | None:
-        """The last hits, moved on as they moved before; with what is known of the values where rays begin."""
+        """The last hits, extrapolated in time, with the known values where rays begin."""
         if not self._frames:
             return None
         last = self._frames[-1]

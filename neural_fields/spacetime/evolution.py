@@ -1,14 +1,13 @@
-"""Evolution laws, the right side of ∂f/∂t = F(x, t, ∇f, …), and the losses that train a field to obey them.
+"""Evolution laws, the right side of ∂f/∂t = F(x, t, ∇f, …), and losses that train a field to obey them.
 
 After Novello et al. 2023, "Neural Implicit Surface Evolution". A `Law` is F. Laws are added and scaled like speeds:
 
     law = transport(motion.velocity) + mean_curvature(0.02)
     loss = law_loss(spacetime_jet(field, x, order=law.order), law).mean()
 
-Under most laws a solution does not stay a distance, and an eikonal loss contradicts the law except on the surface. With
-``extend=True`` a law takes the speed of the surface point x − f ∇f / |∇f| (the extension velocities of Adalsteinsson
-and Sethian 1999): the surface moves the same, and the distance stays one. Use it only near the surface
-(`near_surface`), as near the medial axis that point is not unique.
+Under most laws a solution does not stay a distance, and an eikonal loss contradicts the law off the surface. With
+``extend=True`` a law takes the speed of the surface point x − f ∇f / |∇f| (extension velocities, Adalsteinsson and
+Sethian 1999): the surface moves the same, and the distance stays one. Use it only near the surface (`near_surface`).
 """
 
 from __future__ import annotations
@@ -22,20 +21,6 @@ from torch import Tensor
 from ..fields.field import Field, Jet
 from .field import SpaceTimeJet, at_time
 
-__all__ = [
-    "Law",
-    "VectorField",
-    "curvature",
-    "key_loss",
-    "law_loss",
-    "mean_curvature",
-    "morph",
-    "near_surface",
-    "normal_speed",
-    "tangential_laplacian",
-    "transport",
-]
-
 # Positions (..., 3) and times (...,) to velocities (..., 3), in units of space per unit of time.
 VectorField = Callable[[Tensor, Tensor], Tensor]
 # Positions (..., 3) and times (...,) to speeds (...,) along the outward normal.
@@ -47,7 +32,7 @@ class Law:
     """The right side of ∂f/∂t = F(jet).
 
     Attributes:
-        rate: F, from a `SpaceTimeJet` to ``(...,)``. Any callable will do.
+        rate: F, from a `SpaceTimeJet` to ``(...,)``.
         order: of the jet that it needs: 1, or 2 if it uses the Hessian.
 
     Example:
@@ -64,11 +49,7 @@ class Law:
     order: int = 1
 
     def residual(self, jet: SpaceTimeJet) -> Tensor:
-        """``∂f/∂t − F``, zero where the field obeys. ``(...,)``.
-
-        Raises:
-            ValueError: the law needs second derivatives and the jet has none.
-        """
+        """``∂f/∂t − F`` ``(...,)``, zero where the field obeys; ValueError if the jet lacks second derivatives."""
         if self.order > 1 and not jet.hessian.shape[-1]:
             raise ValueError("this law needs second derivatives; take the jet with order=law.order")
         return jet.rate - self.rate(jet)
@@ -78,18 +59,17 @@ class Law:
         return Law(lambda jet: self.rate(jet) + other.rate(jet), max(self.order, other.order))
 
     def __mul__(self, factor: float) -> Law:
-        """The same motion so many times as fast."""
+        """The same motion, ``factor`` times as fast."""
         return Law(lambda jet: factor * self.rate(jet), self.order)
 
     __rmul__ = __mul__
 
 
 def transport(velocity: VectorField, *, extend: bool = False) -> Law:
-    """The surface is carried by a vector field: ``∂f/∂t = −⟨∇f, V(x, t)⟩``.
+    """The surface is carried by a vector field V: ``∂f/∂t = −⟨∇f, V(x, t)⟩``.
 
-    Args:
-        velocity: V.
-        extend: take V at the surface point below, so that a distance stays one (a rigid motion keeps it anyway).
+    With ``extend`` V is taken at the surface point below, so that a distance stays one (a rigid motion keeps it
+    anyway).
     """
 
     def rate(jet: SpaceTimeJet) -> Tensor:
@@ -100,11 +80,9 @@ def transport(velocity: VectorField, *, extend: bool = False) -> Law:
 
 
 def normal_speed(speed: SpeedField, *, extend: bool = False) -> Law:
-    """The surface moves along its outward normal: ``∂f/∂t = −v(x, t) |∇f|``.
+    """The surface moves along its outward normal with speed v: ``∂f/∂t = −v(x, t) |∇f|``.
 
-    Args:
-        speed: v, positive where it swells.
-        extend: take v at the surface point below, so that a distance stays one.
+    With ``extend`` v is taken at the surface point below, so that a distance stays one.
     """
 
     def rate(jet: SpaceTimeJet) -> Tensor:
@@ -115,15 +93,12 @@ def normal_speed(speed: SpeedField, *, extend: bool = False) -> Law:
 
 
 def morph(guide: Field) -> Law:
-    """Level-set morphing: a guide g(x, t) sets the normal speed, ``−∂g/∂t``, so ``∂f/∂t = |∇f| ∂g/∂t``.
+    """Level-set morphing: a guide g(x, t), not trained, sets the normal speed ``−∂g/∂t``, so ``∂f/∂t = |∇f| ∂g/∂t``.
 
     With `Keyframes` for the guide this is ``∂f/∂t = |∇f| (f_{k+1} − f_k) / (t_{k+1} − t_k)``: a point of the first
-    shape moves outward where it is inside of the second, and as far as the second is away. It is the same law when
-    time runs backward. Novello et al. (and Breen and Whitaker 2001) take ``f_{k+1} − f`` instead, which prefers one end
-    and reaches the other only in the limit; both are driven to their ends by `key_loss`.
-
-    Args:
-        guide: four-dimensional; it is not trained.
+    shape moves outward where it is inside of the second. The law is the same when time runs backward. Novello et al.
+    (and Breen and Whitaker 2001) take ``f_{k+1} − f``, which prefers one end; both are driven to their ends by
+    `key_loss`.
     """
 
     def rate(jet: SpaceTimeJet) -> Tensor:
@@ -137,7 +112,7 @@ def morph(guide: Field) -> Law:
 def mean_curvature(alpha: float, *, extend: bool = False, least: float = 0.1) -> Law:
     """Smoothing by mean curvature: ``∂f/∂t = α |∇f| κ`` with ``κ = div(∇f / |∇f|)``, the sum of both curvatures.
 
-    A sphere shrinks as ``r(t) = √(r₀² − 4αt)``. Negative α sharpens, and is as ill posed as it sounds.
+    A sphere shrinks as ``r(t) = √(r₀² − 4αt)``. Negative α sharpens, and is ill posed.
 
     Args:
         alpha: α, squared units of space per unit of time.
@@ -172,34 +147,31 @@ def curvature(jet: SpaceTimeJet, *, eps: float = 1e-12) -> Tensor:
 
 
 def law_loss(jet: SpaceTimeJet, law: Law, *, eps: float = 1e-4) -> Tensor:
-    """``(∂f/∂t − F)² / |∇f|²``: the squared error of the normal speed. ``(...,)``.
+    """``(∂f/∂t − F)² / |∇f|²`` ``(...,)``: the squared error of the normal speed.
 
-    Units are those of the speed, whatever the slope of f, so one weight serves all laws. The slope is not
-    differentiated: a field shall not obey better by becoming steeper.
+    Its units do not depend on the slope of f, so one weight serves all laws. The slope is not differentiated: a steeper
+    field must not count as obeying better.
     """
     slope = jet.gradient.detach().square().sum(dim=-1)
     return law.residual(jet).square() / (slope + eps)
 
 
 def key_loss(jet: Jet | SpaceTimeJet, target: Jet, *, length: float = 0.05) -> Tensor:
-    """``(f − f_k)² + ℓ² |∇f − ∇f_k|²`` at the time of a known shape f_k. ``(...,)``, squared field units.
+    """``(f − f_k)² + ℓ² |∇f − ∇f_k|²`` ``(...,)`` at the time of a known shape f_k, squared field units; ∇ is by space.
 
-    Args:
-        jet: of the field in training, at the key time; ``∇`` is by space.
-        target: the jet of f_k at the same points.
-        length: ℓ; how far two surfaces that agree in a point may drift apart by their normals before it counts.
+    ``length`` ℓ weighs normals: surfaces that agree in a point may drift apart by so much before it counts.
     """
     value = (jet.value - target.value).square()
     return value + length**2 * (jet.gradient - target.gradient).square().sum(dim=-1)
 
 
 def near_surface(value: Tensor, width: float) -> Tensor:
-    """Weights ``exp(−(f / w)² / 2)`` that let a law speak where it has to be obeyed. ``(...,)``, without a gradient."""
+    """Weights ``exp(−(f / w)² / 2)`` ``(...,)``, without a gradient, that restrict a law to the surface."""
     return (-0.5 * (value.detach() / width).square()).exp()
 
 
 def _point_below(jet: SpaceTimeJet) -> Tensor:
-    """``x − f ∇f / |∇f|²``, taken as given: no gradient flows through where a speed is looked up."""
+    """``x − f ∇f / |∇f|²``, detached: no gradient flows through the place of a speed."""
     gradient = jet.gradient.detach()
     slope = gradient.square().sum(dim=-1, keepdim=True).clamp(min=1e-4)
     return jet.position.detach() - jet.value.detach()[..., None] * gradient / slope

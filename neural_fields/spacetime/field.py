@@ -1,32 +1,29 @@
 """Fields of space and time, and their slices, which are three-dimensional fields again.
 
-A point of space-time is (x, y, z, t) with t in [0, 1]. Whatever takes a `Field` in three dimensions (tracer, mesher,
-viewer) takes a slice, so none of them knows about time.
+A point of space-time is (x, y, z, t) with t in [0, 1]. Tracer, mesher and viewer take a slice.
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import at_least
-from ..fields.field import Field, Jet, SecondJet
+from ..backend.errors import at_least
+from ..fields.field import Field, Jet, SecondJet, Wrapper, solid
 from ..networks.multiscale import MultiscaleSDF, levels_of
 from ..networks.siren import Siren
 
-__all__ = ["SpaceTimeJet", "SpaceTimeSDF", "TimeSlice", "at_time", "spacetime_jet"]
-
 
 class SpaceTimeJet(NamedTuple):
-    """A field at some points of space-time, with the derivatives by space and by time told apart.
+    """A field at some points of space-time, with the derivatives by space and by time apart.
 
     Attributes:
-        position: ``(..., 3)`` where.
-        time: ``(...,)`` when.
+        position: ``(..., 3)``.
+        time: ``(...,)``.
         value: ``(...,)`` f(x, t), negative inside.
         gradient: ``(..., 3)`` ∇f, by space alone; not normalised.
         rate: ``(...,)`` ∂f/∂t; the surface moves along its normal with the speed −rate / |∇f|.
@@ -44,16 +41,9 @@ class SpaceTimeJet(NamedTuple):
 
 
 def spacetime_jet(field: Field, x: Tensor, *, level: int = -1, order: int = 1) -> SpaceTimeJet:
-    """Evaluate a field of space-time at ``x`` ``(..., 4)``.
+    """Evaluate a four-dimensional field at ``x`` ``(..., 4)``, with second derivatives by space if ``order`` is 2.
 
-    Args:
-        field: four-dimensional.
-        x: points (x, y, z, t).
-        level: as in `Field.jet`.
-        order: 1, or 2 for the second derivatives by space too (about three times the cost).
-
-    Raises:
-        ValueError: the field is not four-dimensional, a shape does not fit, or ``order`` is neither.
+    ValueError if the field is not four-dimensional, a shape does not fit, or ``order`` is neither 1 nor 2.
     """
     check_spacetime(field)
     if order not in (1, 2):
@@ -73,17 +63,11 @@ def at_time(x: Tensor, t: Tensor | float) -> Tensor:
     return torch.cat((x, time[..., None]), dim=-1)
 
 
-class SpaceTimeSDF(Field):
+class SpaceTimeSDF(Wrapper):
     """A multiscale signed distance field that moves: bands and residuals live in space-time.
 
-    It wraps a four-dimensional `MultiscaleSDF`: a base SIREN plus residual SIRENs, each one only where
-    |f_i(x, t)| < δ_i, so the band travels with the surface.
-
-    Args:
-        sdf: four-dimensional.
-
-    Raises:
-        ValueError: ``sdf`` is not four-dimensional.
+    It wraps a four-dimensional `MultiscaleSDF`, whose bands |f_i(x, t)| < δ_i travel with the surface. ValueError for a
+    field of another dimension.
 
     Example:
         >>> import torch
@@ -100,47 +84,19 @@ class SpaceTimeSDF(Field):
         self.in_dim, self.num_levels = 4, sdf.num_levels
 
     @property
-    def same_rows(self) -> bool:
-        """True: gating by bands keeps track of the rows."""
-        return True
-
-    @property
-    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands, in units of space."""
-        return self.sdf.deltas
+    def field(self) -> Field:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The four-dimensional field."""
+        return self.sdf
 
     @classmethod
     def from_widths(
-        cls,
-        sizes: Sequence[tuple[int, int]],
-        *,
-        omegas: Sequence[float],
-        deltas: Sequence[float] | None = None,
-        taper: float = 0.0,
-        num_features: int = 0,
-        residual_gain: float = 0.1,
-        time_gain: float = 1.0,
+        cls, sizes: Sequence[tuple[int, int]], *, omegas: Sequence[float], time_gain: float = 1.0, **options: Any
     ) -> SpaceTimeSDF:
-        """Untrained levels; see `MultiscaleSDF.from_widths`.
+        """Untrained levels; the arguments are those of `MultiscaleSDF.from_widths`.
 
-        Args:
-            sizes: (width, depth) of each level.
-            omegas: ω₀ of each level.
-            deltas: half-widths of the bands.
-            taper: see `MultiscaleSDF`.
-            num_features: extra outputs of every level.
-            residual_gain: factor on the residuals' initial output weights.
-            time_gain: factor on the initial weights of t; below 1 the field starts slower in time than in space.
+        ``time_gain`` is a factor on the initial weights of t; below 1 the field starts slower in time than in space.
         """
-        sdf = MultiscaleSDF.from_widths(
-            sizes,
-            omegas=omegas,
-            deltas=deltas,
-            taper=taper,
-            in_dim=4,
-            num_features=num_features,
-            residual_gain=residual_gain,
-        )
+        sdf = MultiscaleSDF.from_widths(sizes, omegas=omegas, in_dim=4, **options)
         with torch.no_grad():
             for level in sdf.levels:
                 assert isinstance(level, Siren)
@@ -151,20 +107,18 @@ class SpaceTimeSDF(Field):
     def from_static(cls, field: Field, *, extra_width: int = 0, time_gain: float = 1.0) -> SpaceTimeSDF:
         """A field of space-time that equals a static one at all times, ready to be trained.
 
-        The weights are copied and those of t start at zero; they learn at once, for their gradients are not zero.
-        The neurons of ``extra_width`` start with random weights but are not listened to: the rows from them to
-        the copied neurons and to the output start at zero.
+        The weights are copied, and those of t start at zero. The neurons of ``extra_width`` start with random weights,
+        but the rows from them to the copied neurons and to the output start at zero.
 
         Args:
-            field: a `Siren` or a `MultiscaleSDF` of them, three-dimensional. It is not changed.
+            field: a three-dimensional `Siren` or a `MultiscaleSDF` of them; not changed.
             extra_width: neurons added to every sine layer of every level.
             time_gain: factor on the initial weights of t of the added neurons.
 
         Raises:
             ValueError: a field of another kind, or ``extra_width`` is negative.
         """
-        if field.in_dim != 3:
-            raise ValueError(f"field.in_dim={field.in_dim}: expected a static field, three-dimensional")
+        field = solid(field)
         at_least(0, extra_width=extra_width)
         taper = field.taper if isinstance(field, MultiscaleSDF) else 0.0
         lifted: list[Field] = []
@@ -180,17 +134,13 @@ class SpaceTimeSDF(Field):
 
     @torch.no_grad()
     def at(self, t: float) -> MultiscaleSDF:
-        """The field of one moment, as a static field of its own: a frozen copy that can be saved like any other.
+        """The field of one moment: a frozen static copy that can be saved like any other.
 
-        The time goes into the biases of the first layers, b + t W_t, so a point costs what it costs in a
-        three-dimensional field. Use `TimeSlice` where the copy must not fall behind a field in training.
+        The time goes into the biases of the first layers, b + t W_t, so a point costs as much as in three dimensions. A
+        `TimeSlice` instead follows a field in training.
         """
         levels = [_slice(level, t) for level in self.sdf.levels]
         return _assembled(levels, self.sdf.deltas, self.sdf.taper).requires_grad_(False)
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        """See `Field.value`; ``x`` is ``(..., 4)``."""
-        return self.sdf.value(x, level=level)
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; the last entry of the gradient is ∂f/∂t."""
@@ -200,23 +150,12 @@ class SpaceTimeSDF(Field):
         """See `Field.second_jet`."""
         return self.sdf.second_jet(x, level=level, dims=dims)
 
-    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
-        """See `Field.level_values`."""
-        return self.sdf.level_values(x, level=level)
 
+class TimeSlice(Wrapper):
+    """The three-dimensional field f(·, t) of a four-dimensional one, which is shared, not copied.
 
-class TimeSlice(Field):
-    """The three-dimensional field f(·, t) of a field of space-time, at one time.
-
-    It follows its field: train that, and the slice has changed. Gradients reach the field, and a time that is a
-    tensor.
-
-    Args:
-        field: four-dimensional; shared, not copied.
-        t: a number or a scalar tensor.
-
-    Raises:
-        ValueError: the field is not four-dimensional, or ``t`` is not one number.
+    It follows the field's training. Gradients reach the field, and a time that is a scalar tensor. ValueError if the
+    field is not four-dimensional, or ``t`` is not one number.
     """
 
     defined_by = ("t",)
@@ -229,53 +168,31 @@ class TimeSlice(Field):
         self.field, self.t = field, t
         self.in_dim, self.num_levels = 3, field.num_levels
 
-    @property
-    def same_rows(self) -> bool:
-        """Whether it holds for the field in space-time."""
-        return self.field.same_rows
-
-    @property
-    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands, those of the whole field."""
-        return self.field.deltas
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        """See `Field.value`."""
-        return self.field.value(self._lifted(x), level=level)
-
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        """See `Field.jet`; the gradient is that by space (see `time_derivative` for the rest)."""
-        value, gradient, features = self.field.jet(self._lifted(x), level=level)
+        """See `Field.jet`; the gradient is that by space (see `time_derivative`)."""
+        value, gradient, features = self.field.jet(self._home(x), level=level)
         return Jet(value, gradient[..., :3], features)
 
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
         """See `Field.second_jet`."""
         dims = self.resolve_dims(dims)
-        value, gradient, features, hessian = self.field.second_jet(self._lifted(x), level=level, dims=dims)
+        value, gradient, features, hessian = self.field.second_jet(self._home(x), level=level, dims=dims)
         return SecondJet(value, gradient[..., :3], features, hessian)
-
-    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
-        """See `Field.level_values`."""
-        return self.field.level_values(self._lifted(x), level=level)
 
     def time_derivative(self, x: Tensor, *, level: int = -1) -> Tensor:
         """∂f/∂t at ``x`` ``(..., 3)`` → ``(...,)``."""
-        return self.field.jet(self._lifted(x), level=level).gradient[..., 3]
+        return self.field.jet(self._home(x), level=level).gradient[..., 3]
 
     def spacetime_jet(self, x: Tensor, *, level: int = -1, order: int = 1) -> SpaceTimeJet:
-        """Everything at ``x`` ``(..., 3)``; see `spacetime_jet`."""
-        return spacetime_jet(self.field, self._lifted(x), level=level, order=order)
+        """Value and all derivatives at ``x`` ``(..., 3)``; see `spacetime_jet`."""
+        return spacetime_jet(self.field, self._home(x), level=level, order=order)
 
-    def _lifted(self, x: Tensor) -> Tensor:
+    def _home(self, x: Tensor) -> Tensor:
         return at_time(self.check_points(x), self.t)
 
 
 def check_spacetime(field: Field) -> None:
-    """Refuse a field that is not four-dimensional.
-
-    Raises:
-        ValueError: it is not.
-    """
+    """Raise ValueError for a field that is not four-dimensional."""
     if field.in_dim != 4:
         raise ValueError(f"field.in_dim={field.in_dim}: expected a field of space-time, four-dimensional")
 
@@ -303,7 +220,7 @@ def _slice(field: Field, t: float) -> Field:
 
 @torch.no_grad()
 def _lift(siren: Siren, extra: int, time_gain: float) -> Siren:
-    """The same function of (x, y, z, t), with unheard neurons added to its layers."""
+    """The same function of (x, y, z, t), with neurons of no effect added to its layers."""
     siren, width = copy.deepcopy(siren), siren.width
     siren.set_units()
     lifted = Siren(width + extra, siren.depth, omega=siren.omega, in_dim=4, num_features=siren.num_features)

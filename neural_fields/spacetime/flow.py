@@ -15,23 +15,11 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import at_least, positive
+from ..backend.errors import at_least, positive
 from ..fields.field import Field
 from ..tracing.projection import project_to_surface
 from .evolution import VectorField
 from .field import TimeSlice, at_time
-
-__all__ = [
-    "IntegrationError",
-    "Solver",
-    "Tracks",
-    "flow",
-    "flow_jacobian",
-    "integrate_rows",
-    "track",
-    "trajectories",
-    "transport_error",
-]
 
 ADAPTIVE = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
 FIXED = ("rk4", "heun3", "heun2", "midpoint", "euler")
@@ -42,7 +30,7 @@ class IntegrationError(RuntimeError):
 
     Attributes:
         time: the time reached, a scalar, or one for each point where each had its own.
-        points: ``(N, 3)`` where the points were then.
+        points: ``(N, 3)`` at that time.
     """
 
     def __init__(self, reason: str, time: Tensor, points: Tensor) -> None:
@@ -61,11 +49,11 @@ class Solver:
         rtol: relative tolerance on every coordinate of every point, adaptive methods only.
         atol: absolute tolerance, likewise; in float32 not below about 1e-6.
         step: step of the fixed methods, in units of time.
-        min_step: an adaptive step this small is taken whatever its error. A stiff field, as near a change of topology,
-            would have the steps shrink to nothing; this trades accuracy there for an end. 0 fails instead.
-        max_steps: give up after so many steps, rejected ones included.
-        adjoint: let gradients come from integrating backward (memory does not grow with the steps) instead of from the
-            recorded steps. Neither costs anything under ``torch.no_grad()`` or where nothing requires gradients.
+        min_step: an adaptive step this small is taken whatever its error: for stiff fields, as near a change of
+            topology, which would shrink steps to nothing. 0 fails instead.
+        max_steps: most steps, rejected ones included.
+        adjoint: gradients from integrating backward (memory does not grow with the steps) instead of the recorded
+            steps.
 
     Raises:
         ValueError: there is no such method, or a number is out of range.
@@ -90,7 +78,7 @@ class Tracks(NamedTuple):
     """Points that followed a surface.
 
     Attributes:
-        points: ``(T, N, 3)`` where each of them is at each time.
+        points: ``(T, N, 3)`` at each time.
         distance: ``(T, N)`` |f| / |∇f| there, about how far from the surface; after the projection if there was one.
     """
 
@@ -99,14 +87,9 @@ class Tracks(NamedTuple):
 
 
 def flow(
-    velocity: VectorField,
-    points: Tensor,
-    start: Tensor | float,
-    end: Tensor | float,
-    *,
-    solver: Solver | None = None,
+    velocity: VectorField, points: Tensor, start: Tensor | float, end: Tensor | float, *, solver: Solver | None = None
 ) -> Tensor:
-    """Where the points of one time are at another: dx/dt = V(x, t) from ``start`` to ``end``.
+    """Move points from one time to another: dx/dt = V(x, t) from ``start`` to ``end``.
 
     Both may be one number, or one for each point: ``flow(V, x, t, 0.0)`` takes samples of space-time, each at its own
     time, back to where they came from, in one integration.
@@ -139,30 +122,43 @@ def flow(
     return integrate_rows(velocity, points, start, end, solver or Solver())
 
 
-class VelocityWithJacobian(Protocol):
-    """A vector field that knows its derivatives, as `mplicits.neural_fields.Velocity`."""
+class VelocityJet(NamedTuple):
+    """A velocity ``value`` ``(..., 3)`` with ``jacobian`` ∂v_i/∂x_j ``(..., 3, 3)`` and ``rate`` ∂v/∂t ``(..., 3)``."""
 
-    def jet(self, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """V ``(N, 3)``, ∂V/∂x ``(N, 3, 3)`` and ∂V/∂t ``(N, 3)``."""
+    value: Tensor
+    jacobian: Tensor
+    rate: Tensor
+
+    @property
+    def divergence(self) -> Tensor:
+        """``tr ∂v/∂x``, ``(...,)``: the growth rate of a small volume."""
+        return self.jacobian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+
+    @property
+    def killing(self) -> Tensor:
+        """``‖J + Jᵀ‖²``, ``(...,)``: 0 for rigid motions only (Killing's equation)."""
+        return (self.jacobian + self.jacobian.transpose(-1, -2)).square().sum(dim=(-2, -1))
+
+
+class Velocity(Protocol):
+    """A velocity with its derivatives."""
+
+    def __call__(self, x: Tensor, t: Tensor) -> Tensor:
+        """Velocities ``(..., 3)`` at positions ``(..., 3)`` and times ``(...,)``."""
+        ...
+
+    def jet(self, x: Tensor, t: Tensor) -> VelocityJet:
+        """Velocities with their derivatives."""
         ...
 
 
 def flow_jacobian(
-    velocity: VelocityWithJacobian,
-    points: Tensor,
-    start: Tensor | float,
-    end: Tensor | float,
-    *,
-    solver: Solver | None = None,
+    velocity: Velocity, points: Tensor, start: Tensor | float, end: Tensor | float, *, solver: Solver | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Where the points of one time are at another, and how their neighbourhoods are strained on the way.
+    """`flow` with the Jacobian M = ∂φ/∂x of the map φ from ``start`` to ``end``: points ``(N, 3)`` and M ``(N, 3, 3)``.
 
-    With φ the map from ``start`` to ``end`` and M = ∂φ/∂x, both are followed together: dM/dt = ∂V/∂x M, M = I at first
-    (the equation of variation). det M says how volume grows; Mᵀ∇f is the gradient of f∘φ. Arguments and errors are
-    those of `flow`; tolerances hold for the entries of M too.
-
-    Returns:
-        Points ``(N, 3)`` and M, ``(N, 3, 3)``.
+    Both are integrated together: dM/dt = ∂V/∂x M, M = I at first (the equation of variation). det M is the growth of
+    volume; Mᵀ∇f is the gradient of f∘φ. Tolerances hold for the entries of M too.
     """
     _check_points(points)
     start, end = _ends(points, start, end)
@@ -179,11 +175,9 @@ def flow_jacobian(
 def trajectories(
     velocity: VectorField, points: Tensor, times: Sequence[float] | Tensor, *, solver: Solver | None = None
 ) -> Tensor:
-    """Paths of points through a vector field, ``(T, N, 3)``, from ``points`` at ``times[0]``; see `flow`.
+    """Paths of points through a vector field, ``(T, N, 3)``, from ``points`` at ``times[0]``.
 
-    Raises:
-        ValueError: shapes do not fit, or the times do not run one way.
-        IntegrationError: as in `flow`.
+    Errors are those of `flow`; ValueError too if the times do not run one way.
     """
     _check_points(points)
     moments = _moments(times, points)
@@ -202,10 +196,10 @@ def transport_error(
     *,
     solver: Solver | None = None,
 ) -> Tensor:
-    """``|f(x(t), t) − f_0(x_0)|`` along characteristics, ``(T, N)``: how far a field is from having been carried by V.
+    """``|f(x(t), t) − f_0(x_0)|`` along characteristics, ``(T, N)``: how far f is from being f_0 carried by V.
 
-    With points of the surface of f_0 it measures the surface alone, which is all that a law with ``extend=True`` asks
-    for; with any points it measures the solution of ∂f/∂t + ⟨∇f, V⟩ = 0.
+    On points x_0 of the surface of f_0 it measures the surface, all that matters to a law with ``extend=True``; on any
+    points the solution of ∂f/∂t + ⟨∇f, V⟩ = 0.
 
     Args:
         field: f, four-dimensional.
@@ -230,7 +224,7 @@ def track(
     least_slope: float = 0.1,
     solver: Solver | None = None,
 ) -> Tracks:
-    """Follow points of a moving surface by its normal velocity, dx/dt = −∂f/∂t ∇f / |∇f|².
+    """Follow points of a moving surface by its normal velocity, dx/dt = −∂f/∂t ∇f / |∇f|²; errors are those of `flow`.
 
     The velocity has no part along the surface: a turning sphere leaves its points where they are.
 
@@ -239,15 +233,10 @@ def track(
         points: ``(N, 3)``, on the surface at ``times[0]``.
         times: increasing or decreasing, ``(T,)``.
         level: whose surface.
-        project: after each time, move the points along ∇f back to the surface, and go on from there. What the
-            integration has missed does not add up then. No gradients flow through a projection.
-        least_slope: |∇f| is taken for at least this much, which bounds the velocity where a surface is
-            torn or vanishes.
+        project: after each time, move the points along ∇f back to the surface, so that errors do not add up. No
+            gradients flow through a projection.
+        least_slope: lower bound on |∇f|, which bounds the velocity where a surface is torn or vanishes.
         solver: the method, its tolerances and its limits.
-
-    Raises:
-        ValueError: shapes do not fit, or the times do not run one way.
-        IntegrationError: as in `flow`.
 
     Example:
         >>> import torch
@@ -287,9 +276,9 @@ class _GaveUpError(Exception):
 
 
 class _Progress(nn.Module):
-    """dx/ds = (t₁ − t₀) V(x, t₀ + s (t₁ − t₀)) for s in [0, 1], which lets every point have its own times.
+    """dx/ds = (t₁ − t₀) V(x, t₀ + s (t₁ − t₀)) for s in [0, 1], with times of each point's own.
 
-    It also remembers where the last step began, for the report of a failure.
+    It keeps where the last step began, for the report of a failure.
     """
 
     def __init__(self, velocity: VectorField, start: Tensor, end: Tensor, points: Tensor, max_steps: int) -> None:
@@ -318,7 +307,7 @@ class _Progress(nn.Module):
 
 
 def integrate_rows(velocity: VectorField, points: Tensor, start: Tensor, end: Tensor, solver: Solver) -> Tensor:
-    """`flow` of rows ``(N, n)`` that hold anything that follows an equation of its own; unchecked."""
+    """`flow` of rows ``(N, n)`` that follow any equation; unchecked."""
     import torchdiffeq  # here, so that the package can be imported without it
 
     longest = float((end - start).detach().abs().max()) if len(points) else 0.0
@@ -330,7 +319,7 @@ def integrate_rows(velocity: VectorField, points: Tensor, start: Tensor, end: Te
     if solver.method in ADAPTIVE:
         options = {
             "min_step": solver.min_step / longest,
-            # The largest error of all, not their root mean square: one point in trouble is not outvoted by the others.
+            # The largest error of all, not their root mean square, which would hide that of a single point.
             "norm": lambda error: error.abs().max(),
             # Land on both ends (the adjoint comes back): stepping over them would interpolate, to a lower order.
             "step_t": interval,

@@ -1,4 +1,4 @@
-"""Moving fields in closed form: ground truth for evolution, as `fields.primitives` is for shapes that stand still."""
+"""Moving fields in closed form, as `fields.primitives` has static ones."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..fields.field import Field, Jet, OneLevelField
-from ..fields.function import FieldLike, as_field
-
-__all__ = ["Keyframes", "Moving", "RigidMotion", "ShrinkingSphere"]
+from ..fields.field import Field, FieldLike, Jet, OneLevelField, Wrapper, as_field, solid
 
 Vector = tuple[float, float, float]
 
@@ -20,13 +17,10 @@ class RigidMotion:
     """A rotation about an axis that itself travels: x(t) = c + v t + R(ω t)(x₀ − c).
 
     Args:
-        axis: direction of the axis; any length but zero.
+        axis: direction of the axis, of any length but zero; ValueError otherwise.
         angle: ω, radians per unit of time.
         center: c, a point on the axis at time 0.
         velocity: v, units per unit of time.
-
-    Raises:
-        ValueError: the axis has no length.
 
     Example:
         >>> import torch
@@ -79,36 +73,20 @@ class RigidMotion:
         return x.new_tensor(self.center), x.new_tensor(self.drift), time
 
 
-class Moving(Field):
-    """A field carried by a rigid motion: f(x, t) = g(x at time 0), a distance at all times if g is one.
+class Moving(Wrapper):
+    """A field g carried by a rigid motion: f(x, t) = g(x at time 0), a distance at all times if g is one.
 
     Args:
         field: g, three-dimensional, with any number of levels; or a function of points ``(..., 3)`` → ``(...,)``.
-        motion: how it moves.
+        motion: the rigid motion.
     """
 
     defined_by = ("motion",)
 
     def __init__(self, field: FieldLike, motion: RigidMotion) -> None:
         super().__init__()
-        field = as_field(field)
-        if field.in_dim != 3:
-            raise ValueError(f"field.in_dim={field.in_dim}: expected a static field, three-dimensional")
-        self.field, self.motion = field, motion
-        self.in_dim, self.num_levels = 4, field.num_levels
-
-    @property
-    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands, those of the field that moves."""
-        return self.field.deltas
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        """See `Field.value`."""
-        return self.field.value(self._home(x), level=level)
-
-    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
-        """See `Field.level_values`."""
-        return self.field.level_values(self._home(x), level=level)
+        self.field, self.motion = solid(field), motion
+        self.in_dim, self.num_levels = 4, self.field.num_levels
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; ∂f/∂t = −⟨∇f, V⟩."""
@@ -125,17 +103,11 @@ class Moving(Field):
 class ShrinkingSphere(OneLevelField):
     """The sphere that mean curvature shrinks, |x| = √(r₀² − 4αt), as a distance or as a solution.
 
-    The distance f = |x| − √(r₀² − 4αt) obeys ∂f/∂t = α|∇f|κ on its surface only: the law would have outer shells
-    shrink more slowly, and they would not stay at their distances. ``exact_law=True`` gives the field
+    The distance f = |x| − √(r₀² − 4αt) obeys ∂f/∂t = α|∇f|κ on its surface only. ``exact_law=True`` gives the field
     f = √(|x|² + 4αt) − r₀ with the same surface, which obeys it everywhere but is a distance at t = 0 only.
 
-    Args:
-        radius: r₀.
-        alpha: α; negative lets it grow.
-        exact_law: which of the two.
-
-    Raises:
-        ValueError: ``radius`` is not positive, or the sphere is gone before t = 1.
+    ``radius`` is r₀, ``alpha`` α (negative: it grows). ValueError if r₀ is not positive, or the sphere vanishes before
+    t = 1.
     """
 
     defined_by = ("radius", "alpha", "exact_law")
@@ -171,8 +143,8 @@ class ShrinkingSphere(OneLevelField):
 class Keyframes(OneLevelField):
     """Shapes at given times, blended in between: f(x, t) = Σ_k w_k(t) f_k(x) with hat functions w_k.
 
-    Before the first time and after the last the field stands still. The blend is exact at the key times; in between
-    it is a guide, not a distance: where ∇f_k and ∇f_{k+1} disagree, |∇f| < 1.
+    Before the first time and after the last the field stands still. In between it is a guide, not a distance: |∇f| < 1
+    where ∇f_k and ∇f_{k+1} disagree.
 
     Args:
         times: strictly increasing.

@@ -1,12 +1,10 @@
 """A velocity for the points of a moving surface: the best motion of the whole shape, and the rest along the normal.
 
-A level set defines only the normal speed v_n = −∂f/∂t / |∇f| of its points. By that alone (see `track`) the points of a
+A level set defines only the normal speed v_n = −∂f/∂t / |∇f| of its points; by that alone (see `track`) the points of a
 travelling ball slide to its rear. This takes the motion u(x) = a + b × x + c x (travel, turn and growth) that explains
 the normal speeds best,
 
     min over a, b, c of Σ (⟨n, u(x)⟩ − v_n(x))²  over points of the surface,   V = u + (v_n − ⟨n, u⟩) n.
-
-Rigid motions are carried exactly, as far as a surface shows them: a sphere that turns looks at rest.
 """
 
 from __future__ import annotations
@@ -14,38 +12,19 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..backend._checks import at_least
+from ..backend.errors import at_least
 from ..fields.field import Field
 from ..tracing.projection import project_to_surface
 from ..tracing.sphere import BOUNDING_RADIUS, ball_points
 from .dynamic_tracing import moment
 from .field import at_time
 
-__all__ = ["CarriedVelocity"]
-
 
 class CarriedVelocity:
-    """V(x, t) on a moving surface, for `flow`: the best motion as a whole, and the normal speed that it leaves.
+    """V(x, t) on the moving surface of a four-dimensional field, for `flow`.
 
-    Args:
-        field: four-dimensional.
-        level: whose surface.
-        nodes: times at which the motion as a whole is found; in between it is interpolated.
-        samples: points of the surface for that, drawn near it at random.
-        least_slope: |∇f| is taken for at least this much, which bounds the velocity where a surface is torn.
-        seed: of the points.
-
-    Raises:
-        ValueError: the field is not four-dimensional, has no such level, or there are fewer than 2 nodes.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Moving, RigidMotion, Sphere, flow
-        >>> from mplicits.neural_fields.spacetime.surface_velocity import CarriedVelocity
-        >>> ball = Moving(Sphere(radius=0.3), RigidMotion(velocity=(0.5, 0.0, 0.0)))
-        >>> there = flow(CarriedVelocity(ball), torch.tensor([[0.0, 0.3, 0.0]]), 0.0, 1.0)
-        >>> bool((there - torch.tensor([[0.5, 0.3, 0.0]])).abs().max() < 1e-3)
-        True
+    The motion as a whole is found at ``nodes`` ≥ 2 times from ``samples`` surface points, and interpolated; |∇f| counts
+    as at least ``least_slope``. Rigid motions are exact as far as normals show them: a turning sphere stays at rest.
     """
 
     def __init__(

@@ -1,13 +1,10 @@
-"""A velocity field that is learnt, and shapes that it carries: motion with correspondences.
+"""A learnt velocity field, and shapes that it carries: motion with correspondences.
 
-A surface that is carried by v(x, t) is f(x, t) = f_k(φ_{t→t_k}(x)): φ follows the characteristic dx/dt = v from time t
-to the time of a known shape. `CarriedKeyframes` blends the shape before and the shape after. Where v carries the first
-onto the second, both agree and the surface only moves; where they differ, as at a change of topology, they are blended.
+A surface carried by v(x, t) is f(x, t) = f_k(φ_{t→t_k}(x)), φ following dx/dt = v from time t to that of a known shape.
+`CarriedKeyframes` blends the shapes before and after; both agree where v carries the first onto the second.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -15,46 +12,8 @@ from torch import Tensor, nn
 from ..fields.field import Jet, OneLevelField
 from ..networks.siren import Siren, plain_jet
 from .field import at_time
-from .flow import Solver, integrate_rows
+from .flow import Solver, Velocity, VelocityJet, integrate_rows
 from .moving import Keyframes
-
-__all__ = ["CarriedKeyframes", "Velocity", "VelocityJet", "VelocitySiren"]
-
-
-class VelocityJet(NamedTuple):
-    """A velocity and its first derivatives.
-
-    Attributes:
-        value: v, ``(..., 3)``.
-        jacobian: ∂v_i/∂x_j, ``(..., 3, 3)``.
-        rate: ∂v/∂t, ``(..., 3)``.
-    """
-
-    value: Tensor
-    jacobian: Tensor
-    rate: Tensor
-
-    @property
-    def divergence(self) -> Tensor:
-        """``tr ∂v/∂x``, ``(...,)``: how fast a small volume grows."""
-        return self.jacobian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
-
-    @property
-    def killing(self) -> Tensor:
-        """``‖J + Jᵀ‖²``, ``(...,)``: 0 for rigid motions, and for no others (Killing's equation)."""
-        return (self.jacobian + self.jacobian.transpose(-1, -2)).square().sum(dim=(-2, -1))
-
-
-class Velocity(Protocol):
-    """A velocity that knows its derivatives."""
-
-    def __call__(self, x: Tensor, t: Tensor) -> Tensor:
-        """Velocities ``(..., 3)`` at positions ``(..., 3)`` and times ``(...,)``."""
-        ...
-
-    def jet(self, x: Tensor, t: Tensor) -> VelocityJet:
-        """The same with the derivatives."""
-        ...
 
 
 class VelocitySiren(nn.Module):
@@ -63,7 +22,7 @@ class VelocitySiren(nn.Module):
     Args:
         width: neurons in each sine layer.
         depth: number of sine layers.
-        omega: the frequency ω₀. Low ones are the prior that neighbours move alike.
+        omega: the frequency ω₀; low ones are the prior that neighbours move alike.
         gain: factor on the initial outputs; training starts from almost standing still.
 
     Example:
@@ -93,17 +52,13 @@ class VelocitySiren(nn.Module):
 class CarriedKeyframes(OneLevelField):
     """Shapes at given times, carried by a velocity: f(x, t) = Σ_k w_k(t) f_k(φ_{t→t_k}(x)), w_k hat functions.
 
-    With v = 0 it is `Keyframes`. At the key times it is the shapes themselves, whatever v. In between values are no
-    distances where v strains; sign and zero set are what counts.
+    At the key times it is the shapes themselves. In between sign and zero set count: values are no distances where v
+    strains.
 
     Args:
         keys: the shapes and their times; shared, not copied.
         velocity: v, as `VelocitySiren` or anything with ``jet``; registered if it is a module.
-        steps: of Runge-Kutta 4 from each moment to each of its two keys. All points take as many, so that what is
-            found at a point does not depend on the others.
-
-    Raises:
-        ValueError: ``steps`` is not positive.
+        steps: of Runge-Kutta 4 from each moment to each of its two keys, at least 1, the same for all points.
     """
 
     defined_by = ("steps",)
@@ -168,8 +123,7 @@ class _Span:
     def with_derivatives(self, state: Tensor, s: Tensor) -> Tensor:
         """The rate of rows ``(N, 15)``: a point, and its derivatives ``(3, 4)`` by where and when it started.
 
-        The exact flow has ∂φ/∂t = −M v(x, t) with M = ∂φ/∂x. Integrated it is the derivative of what is computed, not
-        only up to the error of the steps.
+        The exact flow has ∂φ/∂t = −M v(x, t) with M = ∂φ/∂x; integrated, it is the derivative of what is computed.
         """
         value, jacobian, rate = self.velocity.jet(state[:, :3], self.start + s * self.span)
         change = self.span[:, None, None] * (jacobian @ state[:, 3:].reshape(-1, 3, 4))

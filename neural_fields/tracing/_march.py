@@ -1,7 +1,7 @@
-"""The loops behind `sphere_trace`: rays that march together, and are dropped one by one as they end.
+"""The loops behind `sphere_trace`: rays that march together, and are dropped as they end.
 
-Every pass evaluates the field once for each ray still under way, whether it is striding out, stepping back or closing
-in on a change of sign, so that passes are few and batches large.
+Every pass evaluates the field once for each ray under way, whether it strides out, steps back or closes in on a change
+of sign, so that passes are few and batches large.
 """
 
 from __future__ import annotations
@@ -14,47 +14,30 @@ from torch import Tensor
 
 from ..fields.field import Field
 
-__all__ = ["PATIENCE", "Expected", "Found", "Near", "Rays", "Rule", "Stand", "look", "march", "march_budget"]
-
-# Steps at a gap of one `resolution`, before it doubles: few rays need as many, and none may need thousands.
-PATIENCE = 16
-# How far a step may reach into a band unseen, in δ: stepping to its edge and no further would never arrive.
-BAND_ENTRY = 0.5
-# Share of the widest step that two tangent balls on a plane allow; less than 1 lets surfaces bend towards the ray.
-BOLDNESS = 0.9
-# A ray that leaves the surface faster than this may not stride out any further for it.
-STEEPEST_RISE = 0.6
-# Values this many rounding errors from zero are zero: no step would bring them nearer.
-FLOOR = 8
+PATIENCE = 16  # steps at a gap of one `resolution`, before it doubles: few rays need as many
+BAND_ENTRY = 0.5  # depth of a step into a band unseen, in δ: steps to its edge would never arrive
+BOLDNESS = 0.9  # share of the widest step that two tangent balls on a plane allow: surfaces may bend towards the ray
+STEEPEST_RISE = 0.6  # slope away from the surface above which steps grow no wider
+FLOOR = 8  # rounding errors from zero that count as zero
 
 
 class Expected(NamedTuple):
-    """What is expected of rays; it says where to look first, and nothing about what is there.
+    """Expectations of rays ``(...,)``, which set where to look first.
 
-    Attributes:
-        depth: ``(...,)`` of their hits, infinite for no idea.
-        slope: ``(...,)`` how fast the field falls along the ray there, positive.
-        value: ``(...,)`` of the field where the ray begins, if that is known; infinite elsewhere. Where it is the fall
-            of an even slope, the ray looks at its hit at once.
+    Where ``value`` is the fall of an even slope, the ray is evaluated at its hit at once.
     """
 
-    depth: Tensor
-    slope: Tensor
-    value: Tensor
+    depth: Tensor  # of their hits, infinite if unknown
+    slope: Tensor  # how fast the field falls along the ray there, positive
+    value: Tensor  # of the field where the ray begins, infinite if unknown
 
 
 class Near(NamedTuple):
-    """Which part of each ray comes near the surface, ``(...,)`` each.
+    """The part of each ray near the surface, ``(...,)`` each."""
 
-    Attributes:
-        clear: the last depth that was looked at before it; infinite for rays that never come near.
-        value: there, infinite where the ray begins near the surface.
-        leave: the first depth that was looked at behind it, infinite if there is none.
-    """
-
-    clear: Tensor
-    value: Tensor
-    leave: Tensor
+    clear: Tensor  # the last depth evaluated before it; infinite for rays that never come near
+    value: Tensor  # there, infinite where the ray begins near the surface
+    leave: Tensor  # the first depth evaluated behind it, infinite if there is none
 
 
 class Found:
@@ -69,18 +52,15 @@ class Found:
         unknown = torch.full_like(depth, torch.inf)
         self.near = Near(unknown, unknown.clone(), unknown.clone())
 
-    def record(self, index: Tensor, *, mask: Tensor, depth: Tensor, level: Tensor | int, steps: Tensor | int) -> None:
-        self.mask[index], self.depth[index], self.level[index], self.steps[index] = mask, depth, level, steps
-
-    def record_slope(self, index: Tensor, slope: Tensor) -> None:
-        """How fast the field fell along the rays at their last step."""
-        self.slope[index] = slope
+    def record(
+        self, at: Tensor, mask: Tensor, depth: Tensor, level: Tensor | int, steps: Tensor | int, slope: Tensor | float
+    ) -> None:
+        """Record results of the rays ``at`` these places of the call."""
+        self.mask[at], self.depth[at], self.level[at], self.steps[at] = mask, depth, level, steps
+        self.slope[at] = slope  # how fast the field fell along the ray at its last step
 
     def record_near(self, rays: Rays, close: Tensor, there: Tensor | None = None) -> None:
-        """Note where rays come near the surface and leave it again, before they take in what they see.
-
-        Of those that are not ``there``, ``(K,)`` bool, nothing is noted.
-        """
+        """Record where rays come near the surface and leave it again; only of those ``there`` ``(K,)``, if given."""
         clear, value, leave = (column[rays.ray] for column in self.near)
         first = close & clear.isinf()
         left = torch.where(clear.isfinite(), torch.minimum(leave, rays.depth), torch.inf)
@@ -94,43 +74,24 @@ class Found:
 
 
 class Rays(NamedTuple):
-    """The rays still under way, one row each.
+    """The rays still under way, one row ``(K,)`` or ``(K, 3)`` each."""
 
-    Attributes:
-        ray: ``(K,)`` which ray of the call it is.
-        origin: ``(K, 3)``.
-        direction: ``(K, 3)``.
-        depth: ``(K,)`` where to look next.
-        entry: ``(K,)`` where the search may begin, at most ``depth``.
-        far: ``(K,)`` where to give up.
-        sign: ``(K,)`` −1 for a ray that began inside, else 1; values are multiplied by it.
-        low: ``(K,)`` the last depth known to be in front of the surface.
-        low_value: ``(K,)`` the value there, infinite before the first.
-        free: ``(K,)`` radius of the empty ball there.
-        gap: ``(K,)`` how much of the step from there may lie outside both its balls.
-        high: ``(K,)`` a depth known to be behind the surface, infinite if there is none yet.
-        high_value: ``(K,)`` the value there, negative.
-        boldness: ``(K,)`` share of the widest step that is taken.
-        expected: ``(K,)`` depth of the hit that is expected, infinite for no idea.
-        fall: ``(K,)`` how fast the field is expected to fall there.
-    """
-
-    ray: Tensor
+    ray: Tensor  # row of the call
     origin: Tensor
     direction: Tensor
-    depth: Tensor
-    entry: Tensor
-    far: Tensor
-    sign: Tensor
-    low: Tensor
-    low_value: Tensor
-    free: Tensor
-    gap: Tensor
-    high: Tensor
-    high_value: Tensor
-    boldness: Tensor
-    expected: Tensor
-    fall: Tensor
+    depth: Tensor  # where to evaluate next
+    entry: Tensor  # where the search may begin, at most `depth`
+    far: Tensor  # where to stop
+    sign: Tensor  # −1 for a ray that began inside, else 1; values are multiplied by it
+    low: Tensor  # last depth known to be in front of the surface
+    low_value: Tensor  # value there, infinite before the first
+    free: Tensor  # radius of the empty ball there
+    gap: Tensor  # how much of the step from there may lie outside both its balls
+    high: Tensor  # a depth known to be behind the surface, infinite if unknown
+    high_value: Tensor  # value there, negative
+    boldness: Tensor  # share of the widest step that is taken
+    expected: Tensor  # depth of the expected hit, infinite if unknown
+    fall: Tensor  # how fast the field is expected to fall there
 
     @classmethod
     def begin(cls, origins: Tensor, directions: Tensor, entries: Tensor, starts: Tensor, ends: Tensor) -> Rays:
@@ -157,7 +118,7 @@ class Rays(NamedTuple):
         )
 
     def expecting(self, expected: Expected, rule: Rule) -> Rays:
-        """The same rays, each looking first where its ball is to reach back to the start if all is as expected."""
+        """The rays, each to be evaluated first where its ball just reaches back to the start, if all is as expected."""
         depth, fall, value = (column[self.ray] for column in expected)
         known = depth.isfinite() & (depth > self.depth) & (depth < self.far)
         # The field falls steadily if the way is at most 1.5 times as long as its fall on it tells.
@@ -202,7 +163,7 @@ class Rays(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """The numbers that say what a value allows."""
+    """Bands and settings of a march."""
 
     deltas: Tensor
     tolerance: float
@@ -220,9 +181,9 @@ class Rule(NamedTuple):
 def march(
     field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_steps: int, reach: float | None = None
 ) -> None:
-    """The adaptive mode: one evaluation of every ray under way, then see where each one stands.
+    """The adaptive mode: one evaluation of every ray under way per pass, then `look`.
 
-    With a ``reach`` it is noted where each ray comes so near to the surface, and where it leaves it.
+    With a ``reach``, where each ray comes so near to the surface and where it leaves it is recorded.
     """
     for count in range(1, max_steps + 1):
         if not len(rays.ray):
@@ -239,10 +200,8 @@ def march(
         rays, stand = look(rays, value * rays.sign, rule, gap)
         ended = stand.hit | stand.passed if count < max_steps else torch.ones_like(stand.hit)
         rows = ended.nonzero()[:, 0]
-        found.record(
-            rays.ray[rows], mask=stand.hit[rows], depth=stand.depth[rows], level=stand.level[rows], steps=count
-        )
-        found.record_slope(rays.ray[rows], stand.slope[rows])
+        ends = Stand(*(column[rows] for column in stand))
+        found.record(rays.ray[rows], ends.hit, ends.depth, ends.level, count, ends.slope)
         rays = rays.only((~ended).nonzero()[:, 0])
 
 
@@ -266,7 +225,7 @@ def _from_the_front(field: Field, level: int, rays: Rays, value: Tensor) -> tupl
 
 
 class Stand(NamedTuple):
-    """Where rays stand after a look at their values, ``(K,)`` each."""
+    """State of rays after a look at their values, ``(K,)`` each."""
 
     hit: Tensor
     passed: Tensor
@@ -276,7 +235,7 @@ class Stand(NamedTuple):
 
 
 def look(rays: Rays, value: Tensor, rule: Rule, resolution: Tensor | float) -> tuple[Rays, Stand]:
-    """Take in the ``value`` at ``rays.depth``, and say where to look next."""
+    """Take in the ``value`` at ``rays.depth``, and compute where to look next."""
     level, delta = rule.band(value.abs())
     free = ((value.abs() - delta) / rule.lipschitz).clamp(min=0)
     # Before there are two values: a hit that is expected ahead says how steep the way there is, or else it is head-on.
@@ -349,12 +308,7 @@ def march_budget(
             moving = moving[(step.abs() > tolerance) & (rays.depth[moving] < rays.far[moving])]
         inside = (rays.depth < rays.far).nonzero()[:, 0]
         gone = (rays.depth >= rays.far).nonzero()[:, 0]
-        found.record(
-            rays.ray[gone],
-            mask=torch.zeros_like(gone, dtype=torch.bool),
-            depth=rays.depth[gone],
-            level=current,
-            steps=steps[gone],
-        )
+        missed = torch.zeros_like(gone, dtype=torch.bool)
+        found.record(rays.ray[gone], missed, rays.depth[gone], current, steps[gone], 1.0)
         rays, value, steps = rays.only(inside), value[inside], steps[inside]
-    found.record(rays.ray, mask=value.abs() < capture, depth=rays.depth, level=level, steps=steps)
+    found.record(rays.ray, value.abs() < capture, rays.depth, level, steps, 1.0)

@@ -1,8 +1,7 @@
-"""The loop behind `sphere_trace` for devices that work behind the host's back: the host waits once in many passes.
+"""`march` for accelerators: `PASSES` passes are launched before the host reads how many rays are left.
 
-`march` drops rays as they end, and so has to know after each pass which did. Here `PASSES` passes are launched at once,
-before the host reads how many rays are left. Bands have a capacity that the passes before suggest (`fixed_shapes`); a
-ray that overflows it waits for a pass. So every ray sees the values that it would see in `march`, but for rounding.
+Bands have a capacity that earlier passes suggest (`fixed_shapes`); a ray that overflows waits for a pass. So every ray
+sees the values that it would see in `march`, but for rounding.
 """
 
 from __future__ import annotations
@@ -16,20 +15,15 @@ from ..backend.fixed_shapes import first_rows, fixed_shapes
 from ..fields.field import Field
 from ._march import PATIENCE, Found, Rays, Rule, Stand, look
 
-__all__ = ["march_ahead"]
-
-# Passes before the first look, when many rays are about to leave, and between later ones.
-FIRST_PASSES, PASSES = 8, 16
-# Room in a band while nobody knows better: for all of a few rays, for a share of many.
-FEW, SHARE = 4096, 0.25
-# Room beyond what the passes before have asked for.
-SPARE, LEAST_ROOM = 1.25, 256
+FIRST_PASSES, PASSES = 8, 16  # before the first look, when many rays end, and between later ones
+FEW, SHARE = 4096, 0.25  # first capacity of a band: for all of a few rays, for a share of many
+SPARE, LEAST_ROOM = 1.25, 256  # later capacity: factor on the last demand, and the least
 
 
 def march_ahead(
     field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_steps: int, reach: float | None = None
 ) -> None:
-    """What `march` does, with one wait after the first `FIRST_PASSES` passes, and then every `PASSES`."""
+    """`march`, with one wait after the first `FIRST_PASSES` passes, and then every `PASSES`."""
     count = torch.zeros_like(rays.ray)
     capacity = [max(FEW, int(SHARE * len(rays.ray)))] * level
     passes = FIRST_PASSES
@@ -44,13 +38,13 @@ def march_ahead(
 
 
 class _Chunk:
-    """Some passes of rays, none of which leaves.
+    """Some passes of rays, none of which is dropped.
 
     Attributes:
-        rays: see `Rays`; those that have ended are where they were.
-        count: ``(K,)`` how often each has looked.
+        rays: see `Rays`; those that have ended stay where they were.
+        count: ``(K,)`` evaluations of each.
         ended: ``(K,)`` bool.
-        stand: where each stood when it ended.
+        stand: state of each when it ended.
     """
 
     def __init__(self, field: Field, level: int, rays: Rays, count: Tensor, rule: Rule, max_steps: int) -> None:
@@ -60,7 +54,7 @@ class _Chunk:
         self.stand = Stand(self.ended, self.ended, rays.depth, count, torch.ones_like(rays.depth))
 
     def run(self, passes: int, found: Found, reach: float | None, capacity: Sequence[int]) -> list[Tensor]:
-        """So many passes; then what the rays that ended have found is noted → how much room bands were asked for."""
+        """Do ``passes`` passes, record the rays that ended, and return the requested capacity of each band."""
         demand: list[Tensor] = []
         if self.field.same_rows:
             with fixed_shapes(capacity) as shapes:
@@ -74,9 +68,8 @@ class _Chunk:
         else:  # a field that is evaluated at other rows could not tell which rows overflow
             for _ in range(passes):
                 self._pass(self._values(), ~self.ended, found, reach)
-        ray, stand = self.rays.ray, self.stand
-        found.record(ray, mask=stand.hit, depth=stand.depth, level=stand.level, steps=self.count)
-        found.record_slope(ray, stand.slope)
+        stand = self.stand
+        found.record(self.rays.ray, stand.hit, stand.depth, stand.level, self.count, stand.slope)
         return demand
 
     def _values(self) -> Tensor:
@@ -85,7 +78,7 @@ class _Chunk:
     def _pass(self, value: Tensor, there: Tensor, found: Found, reach: float | None) -> None:
         """Let the rays that are ``there`` take in their values."""
         rays = self.rays
-        # Who is behind the surface where it began goes back, and looks again in the next pass as if for the first time.
+        # A ray that is behind the surface where it began goes back, and looks again as if for the first time.
         back = there & (self.count == 0) & rays.looked_too_far(value, self.rule)
         early = there & (self.count <= 1) & ~back
         front = early & rays.began_behind(value)

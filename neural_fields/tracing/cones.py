@@ -1,4 +1,4 @@
-"""Cones for tiles of an image: how far whole tiles see nothing, before any ray is traced."""
+"""Cones for tiles of an image: how far whole tiles are empty, before any ray is traced."""
 
 from __future__ import annotations
 
@@ -10,21 +10,15 @@ from torch import Tensor
 
 from ..backend.devices import makes_wait
 from ..backend.fixed_shapes import first_rows
-from ..fields.field import Field
-from ..fields.function import FieldLike, as_field
+from ..fields.field import Field, FieldLike, as_field
 from ..networks.multiscale import choose_levels, levels_of
 from ..networks.siren import Siren
 from ._march_gpu import FIRST_PASSES, PASSES
 from .sphere import BOUNDING_RADIUS, ball_crossing, check_rays, unit_directions
 
-__all__ = ["CONE_LIPSCHITZ", "CONE_STEPS", "TILES", "cone_ends", "cone_starts"]
-
-# Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
-CONE_LIPSCHITZ = 1.15
-# Sides of the tiles of pixels that get a cone, each a multiple of the next.
-TILES = (16, 4)
-# Of each cone; those that have not stopped by then leave the rest to their rays.
-CONE_STEPS = 64
+CONE_LIPSCHITZ = 1.15  # of networks, which are steeper than a distance in places; a cone too far loses thin parts
+TILES = (16, 4)  # sides in pixels, each a multiple of the next
+CONE_STEPS = 64  # most steps of a cone; rays do the rest
 
 Columns = tuple[Tensor, ...]
 
@@ -42,28 +36,15 @@ def cone_starts(
     max_steps: int = CONE_STEPS,
     clearance: float = 0.0,
 ) -> Tensor:
-    """Depths up to which whole tiles of an image see nothing, by marching one cone for each tile on level 0.
+    """Depths ``(H, W)`` up to which whole tiles of an image are empty, infinite where nothing can be visible.
 
-    A cone of spread σ (the largest distance between the directions of a tile and its middle one) holds every point of
-    the tile's rays at depth t within tσ of its axis, so with v = |f_0| on the axis the tile is empty up to
-    t + ((v − δ_0)/L − tσ) / (1 + σ). Tiles are marched from large to small, each starting where the larger one ended.
+    They are ``near`` of `sphere_trace` at ``level``, from one cone for each tile, marched on level 0. A cone of spread
+    σ (the largest distance between the directions of a tile and its middle one) holds the tile's rays at depth t within
+    tσ of its axis, so with v = |f_0| on the axis the tile is empty up to t + ((v − δ_0)/L − tσ) / (1 + σ). Tiles are
+    marched from large to small, each starting where the larger one ended, and keep a ``clearance`` from the surface.
 
-    Args:
-        field: what to trace, three-dimensional; or any function of points.
-        origin: ``(3,)`` the common origin of all rays.
-        directions: ``(H, W, 3)`` of any length but 0.
-        level: the level that will be traced from there.
-        tiles: sides of the tiles in pixels, each a multiple of the next.
-        lipschitz: see `sphere_trace`.
-        radius: see `sphere_trace`.
-        max_steps: of each cone.
-        clearance: the tiles keep this far from the surface.
-
-    Returns:
-        ``(H, W)`` depths for ``near`` of `sphere_trace`; infinite where there is nothing to be seen.
-
-    Raises:
-        ValueError: shapes do not fit, or the field is not three-dimensional.
+    ``origin`` is ``(3,)``, ``directions`` ``(H, W, 3)`` of any length but 0; ``tiles`` are sides in pixels, each a
+    multiple of the next. ValueError for other shapes, or a field that is not three-dimensional.
     """
     field = as_field(field)
     level = field.resolve_level(level)
@@ -92,17 +73,10 @@ def cone_ends(
     max_steps: int = CONE_STEPS,
     clearance: float = 0.0,
 ) -> Tensor:
-    """Depths from which on whole tiles of an image see nothing: `cone_starts` from the other side.
+    """Depths ``(H, W)`` from which on whole tiles of an image are empty, for ``far`` of `sphere_trace`.
 
-    Rays that pass a shape closely would take many steps to get away from it again. From behind, with v = |f_0| at depth
-    t on the axis, the tile is empty from (t − (v − δ_0)/L) / (1 − σ) on. Tiles without a pixel of ``wanted`` ``(H, W)``
-    are left out; the other arguments are those of `cone_starts`.
-
-    Returns:
-        ``(H, W)`` depths for ``far`` of `sphere_trace`, infinite in tiles that were left out.
-
-    Raises:
-        ValueError: shapes do not fit, or the field is not three-dimensional.
+    As `cone_starts`, from behind: with v = |f_0| at depth t on the axis, the tile is empty from (t − (v − δ_0)/L) / (1
+    − σ) on. Tiles without a pixel of ``wanted`` ``(H, W)`` are left out, with infinite depths.
     """
     field = as_field(field)
     level = field.resolve_level(level)
@@ -174,7 +148,7 @@ def _march_cones(
 
 
 def _margin(field: Field, level: int, like: Tensor, clearance: float) -> Tensor:
-    """How far cones keep from the surface of level 0, a number on the device of ``like``."""
+    """Distance that cones keep from the surface of level 0, a number on the device of ``like``."""
     return clearance + (field.deltas[0].to(like) if level else like.new_zeros(()))
 
 
@@ -185,17 +159,10 @@ def _until_all_stop(
     advance: Callable[[Columns, Columns, Tensor], tuple[Columns, Tensor]],
     max_steps: int,
 ) -> Columns:
-    """Advance the rows that are ``going`` until none is, or so often.
+    """Advance the rows that are ``going`` ``(K,)`` until none is, at most ``max_steps`` times.
 
-    A CPU looks after each step, and leaves out who has stopped; what works behind the host's back is looked at as in
-    `_march_gpu`.
-
-    Args:
-        fixed: what is known of each row, ``(K, …)`` each.
-        moving: what changes.
-        going: ``(K,)`` bool.
-        advance: from fixed, moving and going to the next moving, and to who goes on, of those that were going.
-        max_steps: of each row.
+    ``advance`` maps the ``fixed`` and ``moving`` columns ``(K, …)`` and the going to the next moving, and to which go
+    on. A CPU looks after each step and leaves out stopped rows; an accelerator is read as rarely as in `_march_gpu`.
     """
     looked, steps = not makes_wait(going.device), 0
     chunk, left = (1, int(going.sum())) if looked else (FIRST_PASSES, len(going))
@@ -216,17 +183,11 @@ def _until_all_stop(
 
 
 class _Cones(NamedTuple):
-    """The tiles of an image, ``C`` of them.
+    """The C tiles of an image."""
 
-    Attributes:
-        axis: ``(C, 3)`` the direction of the middle pixel of each.
-        spread: ``(C,)`` the largest distance of the directions of its pixels from that.
-        of_pixel: ``(H, W)`` which tile each pixel is in.
-    """
-
-    axis: Tensor
-    spread: Tensor
-    of_pixel: Tensor
+    axis: Tensor  # (C, 3) direction of the middle pixel of each
+    spread: Tensor  # (C,) largest distance of the directions of its pixels from that
+    of_pixel: Tensor  # (H, W) tile of each pixel
 
     @classmethod
     def of(cls, directions: Tensor, tile: int) -> _Cones:

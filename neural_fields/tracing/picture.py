@@ -1,8 +1,7 @@
-"""A whole picture in some dozen launches that nobody waits between, recorded as one CUDA graph.
+"""A whole picture in some dozen launches without waiting, recorded as one CUDA graph.
 
-Rays of a pinhole camera, cones for tiles of pixels, the march, the jets at the hits and what pixels see of them: each
-stage writes arrays of one entry for each pixel, and counts on the device how many are in use. The host reads one number
-at the end: how many pixels see the surface.
+Rays of a pinhole camera, cones for tiles of pixels, the march, and the jets at the hits: each stage writes arrays of
+one entry for each pixel, and counts on the device how many are in use. The host reads one number at the end.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -28,16 +27,12 @@ from ..backend.kernels.tracing import Marched, Queue, RayTensors
 from ..fields.field import Field
 from .cones import TILES
 
-__all__ = ["CAMERA", "Drawn", "Setting", "draw"]
-
 # Entries of the tensor of a view, float64: fx, fy, cx, cy; the pose's axes, a row for each world coordinate; the eye;
 # then tolerance, resolution and Lipschitz constant of the march, the reach of a Newton step, and two ones of the cones:
 # the radius of the ball that holds the surface, and how far the eye and that ball reach.
 CAMERA = 22
-# Pixels of a program of the elementwise stages.
-PROGRAM_PIXELS = 1024
-# Graphs that are kept for a field. One of 1920 × 1080 pixels holds about 0.3 GB.
-GRAPHS = 4
+PROGRAM_PIXELS = 1024  # of a program of the elementwise stages
+GRAPHS = 4  # kept for a field; one of 1920 × 1080 pixels holds about 0.3 GB
 
 
 @triton.jit
@@ -54,7 +49,7 @@ def _ball(ox, oy, oz, dx, dy, dz, radius):
 
 @triton.jit
 def make_rays(view, origin, directions, entries, ends, width, count, PIXELS: tl.constexpr):
-    """Rays of pixels, and where they enter and leave the ball; worked out in float64 and rounded once."""
+    """Rays of pixels, and where they enter and leave the ball; computed in float64 and rounded once."""
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     real = pixel < count
     x = ((pixel % width).to(tl.float64) - tl.load(view + 2)) / tl.load(view)
@@ -89,20 +84,9 @@ def _away(directions, pixel, dx, dy, dz, real):
 
 @triton.jit
 def make_cones(
-    view,
-    directions,
-    before,
-    axes,
-    spreads,
-    leaves,
-    depths,
-    width,
-    height,
-    count,
-    SIDE: tl.constexpr,
-    LARGER: tl.constexpr,
-    PIXELS: tl.constexpr,
-):
+    view, directions, before, axes, spreads, leaves, depths, width, height, count,
+    SIDE: tl.constexpr, LARGER: tl.constexpr, PIXELS: tl.constexpr,
+):  # fmt: skip
     """Cones of tiles of SIDE pixels, beginning where those of tiles of LARGER pixels ended, if that is not 0.
 
     All directions of a tile are within the angle of its corners: a cone meets the image in a convex region.
@@ -148,7 +132,7 @@ def make_cones(
 def begin_rays(
     free, entries, ends, starts, listed, queue, mask, width, count, SIDE: tl.constexpr, PIXELS: tl.constexpr
 ):
-    """Let the rays begin where the cones of their tiles end, and list those that begin before they end."""
+    """Begin the rays where the cones of their tiles end, and list those that begin before they end."""
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     real = pixel < count
     tile = (pixel // width // SIDE) * tl.cdiv(width, SIDE) + (pixel % width) // SIDE
@@ -163,7 +147,7 @@ def begin_rays(
 
 @triton.jit
 def count_hits(mask, counts, count, PIXELS: tl.constexpr):
-    """How many pixels of each program's see the surface."""
+    """How many pixels of each program see the surface."""
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     hit = tl.load(mask + pixel, mask=pixel < count, other=0).to(tl.int32)
     tl.store(counts + tl.program_id(0), tl.sum(hit, axis=0))
@@ -171,19 +155,9 @@ def count_hits(mask, counts, count, PIXELS: tl.constexpr):
 
 @triton.jit
 def place_hits(
-    origin,
-    directions,
-    mask,
-    found_depth,
-    counts,
-    hits,
-    pixels,
-    depths,
-    positions,
-    count,
-    PROGRAMS: tl.constexpr,
-    PIXELS: tl.constexpr,
-):
+    origin, directions, mask, found_depth, counts, hits, pixels, depths, positions, count,
+    PROGRAMS: tl.constexpr, PIXELS: tl.constexpr,
+):  # fmt: skip
     """Rows of the pixels that see the surface, in their order, and how many there are."""
     program = tl.program_id(0)
     pixel = program * PIXELS + tl.arange(0, PIXELS)
@@ -203,20 +177,9 @@ def place_hits(
 
 @triton.jit
 def see_hits(
-    view,
-    directions,
-    pixels,
-    hits,
-    values,
-    gradients,
-    depths,
-    positions,
-    normals,
-    sights,
-    SHALLOW: tl.constexpr,
-    NEWTON: tl.constexpr,
-    PIXELS: tl.constexpr,
-):
+    view, directions, pixels, hits, values, gradients, depths, positions, normals, sights,
+    SHALLOW: tl.constexpr, NEWTON: tl.constexpr, PIXELS: tl.constexpr,
+):  # fmt: skip
     """Normals, and with NEWTON the last step along the ray, from the jets at the hits."""
     row = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     real = row < tl.load(hits)
@@ -252,31 +215,20 @@ def see_hits(
 
 
 class Setting(NamedTuple):
-    """What a picture's kernels are compiled for, beside the levels.
+    """Compile-time setting of a picture, beside the levels."""
 
-    Attributes:
-        width: of the image, in pixels.
-        height: likewise.
-        newton: whether hits take a last Newton step, which needs jets of the level that is traced.
-        max_steps: of each ray.
-        cone_steps: of each cone.
-        lipschitz: of the cones.
-        shallow: slope along the ray below which no Newton step is taken.
-        march: the constants of the march, see `mplicits.neural_fields.backend.kernels.tracing.march_rays`.
-    """
-
-    width: int
+    width: int  # of the image, in pixels
     height: int
-    newton: bool
-    max_steps: int
-    cone_steps: int
-    lipschitz: float
-    shallow: float
-    march: tuple[tuple[str, float], ...]
+    newton: bool  # whether hits take a last Newton step, by jets of the level that is traced
+    max_steps: int  # of each ray
+    cone_steps: int  # of each cone
+    lipschitz: float  # of the cones
+    shallow: float  # slope along the ray below which no Newton step is taken
+    march: tuple[tuple[str, float], ...]  # see `march_constants`
 
 
 class Drawn(NamedTuple):
-    """One row for each pixel that sees the surface; see `mplicits.pipelines.render.trace.Seen`."""
+    """One row for each pixel that sees the surface; see `pipelines.render.trace.Seen`."""
 
     pixel: Tensor
     depth: Tensor
@@ -317,11 +269,7 @@ class Picture:
         self.staged = torch.zeros(CAMERA, dtype=torch.float64, pin_memory=device.type == "cuda")
 
     def draw(self, view: list[float]) -> Drawn:
-        """What pixels see, in tensors of their own.
-
-        Args:
-            view: see `CAMERA`.
-        """
+        """The rows of a view (see `CAMERA`), in tensors of their own."""
         self.staged.copy_(torch.tensor(view, dtype=torch.float64))
         self.view.copy_(self.staged, non_blocking=True)
         if self.graph is None and self.begun and self.view.is_cuda:
@@ -339,7 +287,7 @@ class Picture:
         return Drawn(*(column[:rows].clone() for column in self.drawn))
 
     def _launch(self) -> None:
-        """All stages, one after the other."""
+        """All stages, in order."""
         setting, view = self.setting, self.view
         origins, directions, starts, entries, ends = self.rays
         width, height = setting.width, setting.height
@@ -390,12 +338,8 @@ _pictures: WeakKeyDictionary[Field, OrderedDict[tuple[object, ...], Picture]] = 
 def draw(field: Field, traced: Levels, shown: Levels, setting: Setting, view: list[float]) -> Drawn:
     """Draw a picture of a field, by the graph of one like it if there was one.
 
-    Args:
-        field: whose levels these are.
-        traced: up to the level whose surface is seen.
-        shown: up to the level whose gradient gives the normals.
-        setting: see `Setting`.
-        view: see `CAMERA`.
+    ``traced`` are the levels up to the one whose surface is visible, ``shown`` those up to the one whose gradient gives
+    the normals. See `Setting` and, for ``view``, `CAMERA`.
     """
     device = traced.deltas.device
     pointers = tuple(

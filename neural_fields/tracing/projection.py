@@ -1,7 +1,6 @@
-"""Neural attribute mapping of the paper (Sec. 3): what a field g says at points p of another surface S, near f = 0.
+"""Neural attribute mapping of the paper (Sec. 3): attributes g of a field f at points p of another surface near f = 0.
 
-The attributes of f live in its band, ``|f| < δ``. A point of S in the band is asked as it is, since g is constant
-along the normals of f. A point outside is first moved to the surface, down ∇f.
+g lives in the band ``|f| < δ`` and is constant along the normals of f. Points outside the band are first moved down ∇f.
 """
 
 from __future__ import annotations
@@ -12,11 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..fields.field import Field
-from ..fields.function import FieldLike, as_field
+from ..fields.field import Field, FieldLike, as_field
 from ..networks.texture import TextureField
-
-__all__ = ["Mapped", "map_attribute", "map_colors", "project_to_surface"]
 
 
 class Mapped(NamedTuple):
@@ -43,7 +39,7 @@ def project_to_surface(
         field: f; or any function of points ``(..., 3)`` → ``(...,)``.
         points: ``(..., d)``, in the field's coordinates.
         level: whose surface.
-        steps: at most so many evaluations per point; points that have arrived are left alone.
+        steps: most evaluations per point; points that have arrived are left alone.
         tolerance: on ``|f|``, in field units.
 
     Returns:
@@ -88,28 +84,10 @@ def map_attribute(
     level: int = -1,
     batch: int = 1 << 18,
 ) -> Mapped:
-    """The mapping {S, f, g} of the paper at points of any surface S.
+    """The mapping {S, f, g} of the paper at points ``(..., d)`` of any surface S, in the field's coordinates.
 
-    Args:
-        field: f; or a function, as in `project_to_surface`.
-        attribute: g, points ``(N, d)`` of the band → attributes ``(N, C)``.
-        points: of S, ``(..., d)``, in the field's coordinates.
-        delta: half-width of the band, in field units.
-        level: of f.
-        batch: points at a time.
-
-    Raises:
-        ValueError: there is no such level, or the dimension is wrong.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Torus
-        >>> from mplicits.neural_fields.tracing.projection import map_attribute
-        >>> fine = Torus(major=0.5, minor=0.2)
-        >>> mesh = torch.rand(100, 3)
-        >>> normals = map_attribute(fine, lambda x: fine.jet(x).gradient, mesh, delta=0.1)
-        >>> normals.values.shape
-        torch.Size([100, 3])
+    ``attribute`` is g, points ``(N, d)`` of the band → ``(N, C)``; ``delta`` the half-width of the band, in field
+    units; ``batch`` points at a time. Errors are those of `project_to_surface`.
     """
     field = as_field(field)
     rows = field.check_points(points).reshape(-1, field.in_dim)
@@ -119,26 +97,12 @@ def map_attribute(
 
 
 def map_colors(texture: TextureField, points: Tensor, *, batch: int = 1 << 18) -> Mapped:
-    """Neural texture mapping: the colours of a texture at points of any surface near its geometry.
+    """Neural texture mapping: the colours of a texture at points ``(..., d)`` of any surface near its geometry.
 
-    Args:
-        texture: g, with its f and δ.
-        points: ``(..., d)``, in the field's coordinates.
-        batch: points at a time.
-
-    Returns:
-        Colours ``(..., 3)``, those not reached being ``texture.outside``, and which were reached.
-
-    Raises:
-        ValueError: the dimension is wrong.
+    Colours ``(..., 3)`` of points that were not reached are ``texture.outside``. ``batch`` is points at a time.
     """
     values, reached = map_attribute(
-        texture.geometry,
-        texture.colors,
-        points,
-        delta=float(texture.delta),
-        level=texture.geometry_level,
-        batch=batch,
+        texture.geometry, texture.colors, points, delta=float(texture.delta), level=texture.geometry_level, batch=batch
     )
     return Mapped(torch.where(reached[..., None], values, texture.outside.to(values)), reached)
 

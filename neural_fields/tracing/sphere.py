@@ -1,12 +1,8 @@
 """Sphere tracing of any field, with coarse levels leading fine ones (paper Sec. 3 and suppl. "Rendering").
 
-Let v = |f(p)| at a point of a ray. The ball around p that holds no zero of f has the radius
-
-    r = (v − δ_j) / L,
-
-with δ_j the half-width of the first band that v is not inside of (0 inside all of them) and L the Lipschitz constant:
-outside band j the value is that of level j, and the surface lies where |f_j| < δ_j. So one rule serves all levels,
-and the field itself sees to it that a residual is evaluated only inside its band.
+Let v = |f(p)| at a point of a ray. The ball around p that holds no zero of f has the radius r = (v − δ_j) / L, with δ_j
+the half-width of the first band that v is not inside of (0 inside all of them) and L the Lipschitz constant: outside
+band j the value is that of level j, and the surface lies where |f_j| < δ_j. One rule serves all levels.
 """
 
 from __future__ import annotations
@@ -17,12 +13,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..backend._checks import positive
 from ..backend.devices import makes_wait
-from ..fields.field import Field
-from ..fields.function import FieldLike, as_field
+from ..backend.errors import positive
+from ..fields.field import Field, FieldLike, as_field
+from ..fields.similarity import ball_chord
 from ..networks.multiscale import as_levels, choose_levels, levels_of
-from ..volume.weights import ball_chord
 from ._march import (
     BAND_ENTRY,
     BOLDNESS,
@@ -39,37 +34,19 @@ from ._march import (
 )
 from ._march_gpu import march_ahead
 
-__all__ = [
-    "BOUNDING_RADIUS",
-    "MAX_STEPS",
-    "Expected",
-    "Hits",
-    "Near",
-    "ball_crossing",
-    "ball_points",
-    "check_rays",
-    "march_constants",
-    "sphere_trace",
-    "trace_expected",
-    "unit_directions",
-]
-
-# Fields live in the unit sphere; their surfaces may pass it by a little.
-BOUNDING_RADIUS = 1.05
-# Evaluations of a ray after which it ends as a miss.
-MAX_STEPS = 512
+BOUNDING_RADIUS = 1.05  # of surfaces; fields live in the unit sphere, which they may pass a little
+MAX_STEPS = 512  # evaluations of a ray after which it ends as a miss
 
 
 class Hits(NamedTuple):
-    """Where rays meet a surface.
+    """Intersections of rays with a surface.
 
     Attributes:
         mask: ``(...,)`` bool, whether the ray meets it.
-        depth: ``(...,)`` along the ray, in lengths of its direction (a distance where that is 1): the point is
-            origin + depth · direction. For a ray that misses, where its search ended.
-        position: ``(..., 3)`` the point at that depth.
-        level: ``(...,)`` int64, the finest level that had a say in the last step.
-        steps: ``(...,)`` int64, how often the field was evaluated on the ray.
+        depth: ``(...,)`` along the ray, in lengths of its direction; for a ray that misses, where its search ended.
+        position: ``(..., 3)`` the point at that depth, origin + depth · direction.
+        level: ``(...,)`` int64, the finest level that was part of the last value.
+        steps: ``(...,)`` int64, evaluations of the field on the ray.
     """
 
     mask: Tensor
@@ -98,30 +75,30 @@ def sphere_trace(
 ) -> Hits:
     """First intersections of rays with the zero set of a level.
 
-    The default mode runs until the depth of every ray is known to ``tolerance``. Steps are the widest that leave no gap
-    between the balls around two samples if the surface is a plane (Bálint and Valasek 2018); where a gap opens, the
-    step is taken back. The resolution doubles after every 16 steps of a ray. A change of sign is closed in on by the
-    secant rule and bisection in turn. A ray that starts inside the surface looks for the way out.
+    The default mode runs until every depth is known to ``tolerance``. Steps are the widest that leave no gap between
+    the balls around two samples if the surface is a plane (Bálint and Valasek 2018); where a gap opens, the step is
+    taken back. The resolution doubles after every 16 steps of a ray. A change of sign is closed in on by the secant
+    rule and bisection in turn. A ray that starts inside the surface looks for the way out.
 
     With a ``budget``, the paper's mode: so many steps ``t ← t + f_j − δ_j`` on each level (20, 5, 5 in its Tab. 4),
     after which |f| < ``capture`` is a hit.
 
     With ``differentiable``, depth and position carry the derivatives of the implicit function f(o + t d) = 0 with
     respect to origins, directions and parameters: dt = −(df + ⟨∇f, do + t dd⟩) / ⟨∇f, d⟩. They grow without bound where
-    rays graze the surface.
+    rays graze.
 
     Args:
         field: what to trace, three-dimensional; or any function of points ``(..., 3)`` → ``(...,)``.
         origins: ``(..., 3)``.
         directions: ``(..., 3)`` of any length but 0; broadcast with ``origins``.
         level: whose surface to find.
-        near: depth at which to start, a number or a tensor that broadcasts to ``(...,)``: up to there nothing is
-            expected (see `cone_starts`). A ray that is behind the surface there starts from the beginning instead.
-        far: depth at which to give up.
-        tolerance: of the depth, in the field's units. The precision of the numbers sets a limit of its own.
+        near: depth at which to start, a number or a tensor that broadcasts to ``(...,)``, see `cone_starts`. A ray that
+            is behind the surface there starts from the beginning instead.
+        far: depth at which to stop.
+        tolerance: of the depth, in the field's units; limited by the precision of the numbers.
         resolution: two crossings nearer to each other than this may be overlooked.
         lipschitz: bound L on the slope of the field.
-        radius: the surface lies in the ball of this radius around the origin; None where it may lie anywhere.
+        radius: the surface lies in the ball of this radius around 0; None where it may lie anywhere.
         max_steps: rays that need more end as misses.
         budget: steps on each level up to ``level``, for the fixed mode.
         capture: the |f| that the fixed mode takes for a hit.
@@ -141,19 +118,9 @@ def sphere_trace(
     field = as_field(field)
     if budget is None:
         hits, _, _ = trace_expected(
-            field,
-            origins,
-            directions,
-            None,
-            level=level,
-            near=near,
-            far=far,
-            tolerance=tolerance,
-            resolution=resolution,
-            lipschitz=lipschitz,
-            radius=radius,
-            max_steps=max_steps,
-        )
+            field, origins, directions, None, level=level, near=near, far=far, tolerance=tolerance,
+            resolution=resolution, lipschitz=lipschitz, radius=radius, max_steps=max_steps,
+        )  # fmt: skip
     else:
         check_rays(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
         hits = _trace_budget(field, origins, directions, budget, level, near, far, tolerance, radius, capture)
@@ -215,24 +182,15 @@ def trace_expected(
     max_steps: int = MAX_STEPS,
     reach: float | None = None,
 ) -> tuple[Hits, Tensor, Near]:
-    """`sphere_trace` in the default mode, with an idea of where the hits will be.
+    """`sphere_trace` in the default mode, with expected depths and slopes of the hits, and values at ``near``, if any.
 
-    A ray that expects a hit looks first at a point so near to it that the ball there just reaches back to ``near``, if
-    the field falls as it is said to, and steps from there as if it did. Where it does not, the ray finds a gap between
-    its balls, or itself behind the surface, and goes back. A wrong depth or slope costs steps, and changes nothing
-    else. But a ``value`` of an expectation is believed: where it says that the field falls evenly from ``near`` to the
+    A ray first looks so near to its expected hit that the ball there just reaches back to ``near``. Where the field
+    does not fall as expected, the ray finds a gap between its balls, or itself behind the surface, and goes back: wrong
+    depths and slopes only cost steps. But a ``value`` is trusted: where it implies an even fall from ``near`` to the
     hit, nothing else is looked for in between.
 
-    ``expected`` has depths and slopes ``(...,)`` of the hits, and values at ``near``; None for no idea. With a
-    ``reach`` it is noted where rays come nearer than this to the surface. The other arguments are those of
-    `sphere_trace`.
-
-    Returns:
-        The hits, how fast the field fell along each ray at its last step ``(...,)``, to be expected the next time,
-        and where the ray came within ``reach`` of the surface.
-
-    Raises:
-        ValueError: see `sphere_trace`.
+    Returns the hits, how fast the field fell along each ray at its last step ``(...,)``, and, with a ``reach``, where
+    the ray came within it of the surface.
     """
     level = field.resolve_level(level)
     check_rays(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
@@ -257,7 +215,7 @@ def trace_expected(
 
 
 def march_constants(dtype: torch.dtype) -> dict[str, float]:
-    """The numbers of `_march` that the fused kernels are compiled for."""
+    """Constants of `_march` that the fused kernels are compiled for."""
     return {
         "PATIENCE": PATIENCE,
         "BOLDNESS": BOLDNESS,
@@ -268,7 +226,7 @@ def march_constants(dtype: torch.dtype) -> dict[str, float]:
 
 
 def _march_fused(field: Field, level: int, spans: tuple[Tensor, ...], found: Found, rule: Rule, max_steps: int) -> None:
-    """What `march` does, by the fused kernels; what they find has the same bounds, and not the same last bits."""
+    """`march` by the fused kernels, with the same bounds, but for the last bits."""
     from ..backend.kernels.paths import march_fused
     from ..backend.kernels.tracing import Marched, Queue, RayTensors
 
@@ -285,16 +243,11 @@ def _march_fused(field: Field, level: int, spans: tuple[Tensor, ...], found: Fou
 
 
 def _begin(
-    origins: Tensor,
-    directions: Tensor,
-    length: Tensor,
-    near: Tensor | float,
-    far: Tensor | float,
-    radius: float | None,
+    origins: Tensor, directions: Tensor, length: Tensor, near: Tensor | float, far: Tensor | float, radius: float | None
 ) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor], Found]:
-    """Flat rays, as `Rays.begin` takes them, inside the ball of ``radius``; and memory for what they find.
+    """Flat rays, as `Rays.begin` takes them, inside the ball of ``radius``; and memory for their results.
 
-    The directions are of unit length; ``near`` and ``far`` count in the ``length`` that they had.
+    Directions are of unit length; ``near`` and ``far`` count in the ``length`` that they had.
     """
     origins, directions = torch.broadcast_tensors(origins, directions)
     shape = directions.shape[:-1]
@@ -308,12 +261,12 @@ def _begin(
 
 
 def _like(number: Tensor | float, other: Tensor) -> Tensor:
-    """A number where ``other`` is, and as precise; one of the host's is filled in there, which nobody waits for."""
+    """A number on the device and in the dtype of ``other``, filled in there without waiting."""
     return number.to(other) if isinstance(number, Tensor) else other.new_full((), number)
 
 
 def _hits(found: Found, origins: Tensor, directions: Tensor, length: Tensor) -> Hits:
-    """What was found, in the shape of the rays; see `_begin`."""
+    """Results in the shape of the rays; see `_begin`."""
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
     depth = found.depth.reshape(shape)
     position = origins + depth[..., None] * directions
@@ -323,11 +276,7 @@ def _hits(found: Found, origins: Tensor, directions: Tensor, length: Tensor) -> 
 
 
 def check_rays(field: Field, origins: Tensor, directions: Tensor, **numbers: float) -> None:
-    """Refuse a field that is not three-dimensional, rays that are not, and numbers that are not positive.
-
-    Raises:
-        ValueError: names what came.
-    """
+    """Raise ValueError unless field and rays are three-dimensional, and ``numbers`` positive."""
     if field.in_dim != 3:
         raise ValueError(f"field.in_dim={field.in_dim}: rays are traced in three dimensions; take a TimeSlice")
     for name, rows in (("origins", origins), ("directions", directions)):

@@ -1,8 +1,7 @@
 """Volume rendering of any field as in NeuS: `sample_rays`, then `render_samples`; `render_volume` does both.
 
-Samples are placed by the coarsest level alone. One jet per sample then gives value, gradient and features, and inside a
-`MultiscaleSDF` the residual levels evaluate only the samples in their bands. Colours are evaluated only for samples
-that contribute to their pixel.
+Samples are placed by the coarsest level alone. One jet per sample gives value, gradient and features; residual levels
+are evaluated only in their bands, and colours only for samples that contribute to their pixel.
 """
 
 from __future__ import annotations
@@ -12,16 +11,15 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial, wraps
-from typing import Any, NamedTuple, Protocol, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from torch import Tensor
 
-from ..backend._checks import at_least, positive
 from ..backend.devices import precise, uniform
+from ..backend.errors import at_least, positive
 from ..backend.fixed_shapes import chosen
-from ..fields.field import Field, Jet
-from ..fields.function import FieldLike, as_field
+from ..fields.field import Field, FieldLike, Jet, as_field
 from .weights import (
     composite,
     importance_depths,
@@ -35,48 +33,26 @@ from .weights import (
     transmittance_weights,
 )
 
-__all__ = [
-    "RayColor",
-    "RayOutside",
-    "Rendered",
-    "Samples",
-    "Sampling",
-    "render_samples",
-    "render_volume",
-    "sample_depths",
-    "sample_rays",
-]
-
 RayColor = Callable[[Tensor, Tensor, Jet], Tensor]
 """Colours ``(N, 3)`` of points ``(N, 3)`` seen along unit directions ``(N, 3)``, given the geometry's jet there."""
-
+RayOutside = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Density ``(N,)`` ≥ 0 and colour ``(N, 3)`` outside the unit sphere, at `invert_outside` points ``(N, 4)``."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-class RayOutside(Protocol):
-    """What lies outside the unit sphere."""
-
-    def __call__(self, inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Density ``(N,)`` ≥ 0 and colour ``(N, 3)`` at `invert_outside` points ``(N, 4)``."""
-        ...
-
-
 @dataclass(frozen=True)
 class Sampling:
-    """How many samples a ray gets, and where.
+    """Number and places of the samples of a ray. ValueError if a number is out of range.
 
     Attributes:
         uniform: evenly spaced depths.
         importance: further depths near the surface, at the coarsest level.
-        rounds: in how many rounds these are placed, each with twice the sharpness of the one before.
+        rounds: in which these are placed, each with twice the sharpness of the one before.
         sharpness: inv_std of the first round.
-        outside: samples behind the region of interest, if something is there.
+        outside: samples behind the region of interest, if there is a background field.
         band_sharpness: highest inv_std of a round in units of 1/δ₀; half of the samples then lie within δ₀ / 15.
-        skip_sharpness: the same for the weights that decide what is skipped; a finer surface may lie δ₀ / 8 away.
-
-    Raises:
-        ValueError: a number is out of range.
+        skip_sharpness: the same for the weights by which intervals are skipped; a finer surface may lie δ₀ / 8 away.
     """
 
     uniform: int = 64
@@ -100,8 +76,8 @@ class Samples(NamedTuple):
     Attributes:
         t_starts: ``(R, S)`` depth at which each begins.
         t_ends: ``(R, S)`` depth at which each ends, where the next begins.
-        counts: ``(R, S)`` how many intervals each stands for in a mean over all of them: 1 if none was skipped, else 0
-            for skipped ones and 1 / ``skip_share`` for those kept by chance. 0 on rays that miss the unit sphere.
+        counts: ``(R, S)`` weight in a mean over all intervals: 1, or 0 for skipped ones and 1 / ``skip_share`` for
+            those kept by chance. 0 on rays that miss the unit sphere.
         skipped: whether intervals with a count of 0 are left out of the rendering.
     """
 
@@ -112,12 +88,12 @@ class Samples(NamedTuple):
 
 
 class Rendered(NamedTuple):
-    """What rays see.
+    """Rendered rays.
 
     Attributes:
         color: ``(R, 3)``, the background included.
         opacity: ``(R,)`` share of the ray that ends inside the unit sphere, in [0, 1].
-        depth: ``(R,)`` Σ w t, so depth / opacity is the mean depth of what is seen.
+        depth: ``(R,)`` Σ w t, so depth / opacity is the mean depth.
         normal: ``(R, 3)`` Σ w ∇f/|∇f|; shorter than 1 where normals differ or the ray passes.
         weights: ``(R, S)``.
         depths: ``(R, S)`` the middles of the intervals.
@@ -169,8 +145,8 @@ def render_volume(
 ) -> Rendered:
     """Render rays through the unit sphere; differentiable in the rays and all parameters, ``inv_std`` too.
 
-    Inside `fixed_shapes` the intervals, colours and rays that are chosen have the ``rooms`` "sections", "colors" and
-    "outside", and the host never waits.
+    Inside `fixed_shapes` the chosen intervals, colours and rays have the capacities "sections", "colors" and "outside",
+    and the host never waits.
 
     Args:
         field: the geometry, in unit-sphere coordinates; or any function of points ``(..., 3)`` → ``(...,)``.
@@ -181,14 +157,14 @@ def render_volume(
         sampling: where to sample.
         cos_anneal: see `neus_optical_depth`.
         level: level of the field to render.
-        background: ``(3,)`` or ``(R, 3)`` colour of what light passes the sphere; None is black.
-        outside: what is behind the sphere; ``background`` is then behind that.
-        early_stop_eps: colours are evaluated only for samples of a larger weight, and ``outside`` only for rays of
-            which more light is left. A pixel's error is at most this times the number of its samples and one.
+        background: ``(3,)`` or ``(R, 3)`` colour behind everything; None is black.
+        outside: background field outside the sphere.
+        early_stop_eps: colours are evaluated only for samples of a larger weight, and ``outside`` only for rays with
+            more light left. A pixel's error is at most this times the number of its samples and one.
         alpha_threshold: intervals are skipped whose weight, estimated from values of the coarsest level at their ends,
             is smaller; 0 skips none. Neighbours of kept intervals are kept, and the one with the smallest value of each
-            ray. Each channel of a ray's colour changes by at most the sum of the weights that were skipped.
-        skip_share: of the intervals to skip, this share is kept nevertheless, drawn by ``generator``.
+            ray. Each channel of a ray's colour changes by at most the sum of the skipped weights.
+        skip_share: share of the intervals to skip that is kept nevertheless, drawn by ``generator``.
         sdf_grid: values of points ``(..., 3)`` → ``(...,)`` that place and skip samples in place of the coarsest level;
             for example a `ValueGrid`, which costs no network.
         generator: jitters the samples, for training; None is deterministic.
@@ -233,10 +209,7 @@ def sample_rays(
 ) -> Samples:
     """Cut rays ``(R, 3)`` through the unit sphere into intervals, short ones near the surface; without a graph.
 
-    The arguments are those of `render_volume`. ``inv_std`` matters only with an ``alpha_threshold``.
-
-    Raises:
-        ValueError: see `render_volume`.
+    Arguments and errors are those of `render_volume`. ``inv_std`` matters only with an ``alpha_threshold``.
     """
     if origins.shape != directions.shape or origins.ndim != 2 or origins.shape[1] != 3:
         raise ValueError(
@@ -280,12 +253,9 @@ def render_samples(
     early_stop_eps: float = 0.0,
     generator: torch.Generator | None = None,
 ) -> Rendered:
-    """Render rays ``(R, 3)`` that `sample_rays` has cut into intervals; differentiable as `render_volume`.
+    """Render rays ``(R, 3)`` that `sample_rays` has cut into intervals; arguments as in `render_volume`.
 
-    The arguments are those of `render_volume`; ``outside_samples`` is the number of samples of a ray in ``outside``.
-
-    Raises:
-        ValueError: there is no such level.
+    ``outside_samples`` is the number of samples of a ray in ``outside``.
     """
     field, (t_starts, t_ends, counts, skipped) = as_field(field), samples
     interval = t_ends - t_starts
@@ -343,7 +313,7 @@ def sample_depths(
 ) -> Tensor:
     """The ends of the intervals of each ray, ``(R, uniform + importance + 2)``, from ``near`` to ``far``, sorted.
 
-    Only the coarsest level is evaluated, or ``sdf_grid`` in its place. If a finer one is meant, the sharpness ends at
+    Only the coarsest level is evaluated, or ``sdf_grid``. If a finer one is meant, the sharpness ends at
     ``band_sharpness`` / δ₀, so that samples reach into the band in which the finer surface may lie.
     """
     depths = stratified_depths(near, far, sampling.uniform, generator=generator)
@@ -401,7 +371,7 @@ def _behind(
     background: Tensor | None,
     generator: torch.Generator | None,
 ) -> Tensor:
-    """The colour ``(R, 3)`` of what lies behind the unit sphere, from ``count`` samples."""
+    """The colour ``(R, 3)`` behind the unit sphere, from ``count`` samples."""
     # A ray that misses the sphere begins to see the outside where it is nearest to the centre.
     nearest = torch.maximum(far, -(origins * directions).sum(dim=-1))
     depths = outside_depths(nearest, count, generator=generator)

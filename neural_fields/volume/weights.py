@@ -2,46 +2,18 @@
 
 A ray x(t) = o + t v is cut into intervals. With Φ_s(f) = 1 / (1 + e^{−s f}), an interval along which f falls from f_in
 to f_out stops the share α = max(0, 1 − Φ_s(f_out) / Φ_s(f_in)) = 1 − e^{−τ} of the light, with the optical depth τ =
-softplus(−s f_out) − softplus(−s f_in). Transmittances are T_i = exp(−Σ_{j<i} τ_j), the weights w_i = T_i α_i. So Σ w_i
-+ T_end = 1 holds by telescoping, without products that underflow.
+softplus(−s f_out) − softplus(−s f_in). Transmittances are T_i = exp(−Σ_{j<i} τ_j), the weights w_i = T_i α_i, so Σ w_i
++ T_end = 1 without products that underflow.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
 from ..backend.devices import uniform
-
-__all__ = [
-    "ball_chord",
-    "composite",
-    "importance_depths",
-    "invert_outside",
-    "neus_alpha",
-    "neus_optical_depth",
-    "outside_depths",
-    "ray_points",
-    "secant_weights",
-    "sphere_span",
-    "stratified_depths",
-    "transmittance_weights",
-]
-
-
-class Weights(NamedTuple):
-    """How much each interval of a ray contributes.
-
-    Attributes:
-        weights: ``(R, S)``, w_i = T_i α_i.
-        remaining: ``(R,)``, the transmittance behind the last interval; Σ w_i + remaining = 1.
-    """
-
-    weights: Tensor
-    remaining: Tensor
+from ..fields.similarity import ball_chord
 
 
 def neus_optical_depth(
@@ -49,8 +21,8 @@ def neus_optical_depth(
 ) -> Tensor:
     """Optical depth τ ≥ 0 of intervals, from the field at their middles (NeuS, Eq. 13, in logarithms).
 
-    The field is extended along the ray by its slope c: f_in, f_out = f ∓ c Δ / 2. Early in training a half-open
-    slope keeps gradients alive where the surface looks away: c′ = −((1 − a) relu(½ − ½c) + a relu(−c)).
+    The field is extended along the ray by its slope c: f_in, f_out = f ∓ c Δ / 2. Early in training a half-open slope
+    keeps gradients alive where the surface looks away: c′ = −((1 − a) relu(½ − ½c) + a relu(−c)).
 
     Args:
         value: ``(...,)`` f at the middle of each interval.
@@ -79,8 +51,8 @@ def neus_alpha(
     return -torch.expm1(-neus_optical_depth(value, slope, interval, inv_std, cos_anneal=cos_anneal))
 
 
-def transmittance_weights(optical_depth: Tensor) -> Weights:
-    """Weights of the intervals of each ray, from their optical depths ``(R, S)``, first to last.
+def transmittance_weights(optical_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights w_i ``(R, S)`` of intervals from their optical depths ``(R, S)``, and the light left behind all ``(R,)``.
 
     Example:
         >>> import torch
@@ -91,8 +63,8 @@ def transmittance_weights(optical_depth: Tensor) -> Weights:
     passed = optical_depth.cumsum(dim=-1)
     weights = (optical_depth - passed).exp() * -torch.expm1(-optical_depth)
     if optical_depth.shape[-1] == 0:
-        return Weights(weights, optical_depth.new_ones(optical_depth.shape[:-1]))
-    return Weights(weights, (-passed[..., -1]).exp())
+        return weights, optical_depth.new_ones(optical_depth.shape[:-1])
+    return weights, (-passed[..., -1]).exp()
 
 
 def composite(weights: Tensor, values: Tensor) -> Tensor:
@@ -105,30 +77,10 @@ def ray_points(origins: Tensor, directions: Tensor, depths: Tensor) -> Tensor:
     return origins[:, None] + depths[..., None] * directions[:, None]
 
 
-def ball_chord(origins: Tensor, directions: Tensor, radius: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Depth at which lines are nearest to 0, and half the length of their way through a ball around it, 0 if they miss.
-
-    Args:
-        origins: ``(R, 3)``.
-        directions: ``(R, 3)`` unit vectors.
-        radius: of the ball, one or ``(R,)``.
-    """
-    middle = -(origins * directions).sum(dim=-1)
-    # From the nearest point, and not from |o|² − middle², which cancels for far cameras.
-    squared = radius**2 - (origins + middle[:, None] * directions).square().sum(dim=-1)
-    return middle, squared.clamp(min=0).sqrt()
-
-
 def sphere_span(origins: Tensor, directions: Tensor, *, radius: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave a sphere around the origin: depths ``(R,)`` and ``(R,)``.
+    """Depths ``(R,)`` at which rays with unit directions enter and leave a sphere around 0.
 
-    The span of a ray that misses the sphere, or leaves it behind itself, has no length. Rays that start inside begin
-    at depth 0.
-
-    Args:
-        origins: ``(R, 3)``.
-        directions: ``(R, 3)`` unit vectors.
-        radius: of the sphere.
+    The span of a ray that misses the sphere, or leaves it behind itself, has no length. Rays inside begin at depth 0.
     """
     middle, half = ball_chord(origins, directions, radius)
     far = (middle + half).clamp(min=0)
@@ -138,8 +90,7 @@ def sphere_span(origins: Tensor, directions: Tensor, *, radius: float = 1.0) -> 
 def stratified_depths(near: Tensor, far: Tensor, count: int, *, generator: torch.Generator | None = None) -> Tensor:
     """``count`` increasing depths ``(R, count)`` from near to far ``(R,)``: one in each of as many equal strata.
 
-    With a generator the depths of a ray are shifted together by a random part of a stratum; without, they are
-    the middles of the strata.
+    With a generator the depths of a ray are shifted together by a random part of a stratum; else they are the middles.
     """
     shift = uniform((len(near), 1), generator, near.device) if generator else 0.5
     strata = (torch.arange(count, device=near.device) + shift) / count
@@ -149,16 +100,10 @@ def stratified_depths(near: Tensor, far: Tensor, count: int, *, generator: torch
 def secant_weights(
     depths: Tensor, values: Tensor, inv_std: Tensor | float, *, cos_anneal: Tensor | float = 1.0
 ) -> Tensor:
-    """Weights ``(R, S − 1)`` of the intervals between depths, from the field's values at their ends alone.
+    """Weights ``(R, S − 1)`` of intervals from the values ``(R, S)`` at their ends, the increasing depths ``(R, S)``.
 
-    The slope is the lesser (steeper) one of the interval's own secant and the one before, so that an interval which the
-    surface enters through its end is found as well (NeuS, suppl. "hierarchical sampling").
-
-    Args:
-        depths: ``(R, S)`` increasing, S ≥ 2.
-        values: ``(R, S)`` the field there.
-        inv_std: s of the weights.
-        cos_anneal: see `neus_optical_depth`.
+    The slope is the steeper one of the interval's own secant and the one before, so that an interval which the surface
+    enters through its end is found as well (NeuS, suppl. "hierarchical sampling").
     """
     interval = depths.diff(dim=1)
     secant = values.diff(dim=1) / interval.clamp(min=1e-9)
@@ -166,22 +111,15 @@ def secant_weights(
     # Secants over tiny intervals are not bounded by the network's Lipschitz constant.
     slope = torch.minimum(secant, previous).clamp(-10.0, 0)
     middle = 0.5 * (values[:, 1:] + values[:, :-1])
-    return transmittance_weights(neus_optical_depth(middle, slope, interval, inv_std, cos_anneal=cos_anneal)).weights
+    return transmittance_weights(neus_optical_depth(middle, slope, interval, inv_std, cos_anneal=cos_anneal))[0]
 
 
 def importance_depths(
     depths: Tensor, values: Tensor, count: int, inv_std: Tensor | float, *, generator: torch.Generator | None = None
 ) -> Tensor:
-    """``count`` more depths on each ray, where the field's weights say that its surface is → ``(R, count)``, sorted.
+    """``count`` more depths on each ray near its surface, ``(R, count)``, sorted: quantiles of the `secant_weights`.
 
-    The new depths are quantiles of the piecewise constant density of `secant_weights`.
-
-    Args:
-        depths: ``(R, S)`` increasing, S ≥ 2.
-        values: ``(R, S)`` the field there.
-        count: how many.
-        inv_std: s of the weights; doubled from one round to the next.
-        generator: draws stratified quantiles; without, they are the middles of ``count`` equal parts.
+    A ``generator`` draws stratified quantiles; without, they are the middles of ``count`` equal parts.
     """
     interval = depths.diff(dim=1)
     weights = secant_weights(depths, values, inv_std)
@@ -210,8 +148,7 @@ def outside_depths(far: Tensor, count: int, *, generator: torch.Generator | None
 def invert_outside(points: Tensor) -> Tensor:
     """(x, y, z) outside the unit sphere → (x, y, z) / r and 1 / r, four numbers in [−1, 1] (NeRF++, Sec. 4).
 
-    Args:
-        points: ``(..., 3)``; inside the unit sphere they are taken as if they lay on it.
+    Points inside the unit sphere are taken as if on it.
     """
     radius = torch.linalg.vector_norm(points, dim=-1, keepdim=True).clamp(min=1)
     return torch.cat((points / radius, 1 / radius), dim=-1)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Field, Mesh, NoSurfaceError, TimeSlice, at_time, extract_mesh
-from ...neural_fields.fields.function import FieldLike
+from ...neural_fields.fields.field import FieldLike
 from ..surface.surface import components
 
 

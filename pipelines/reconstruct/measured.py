@@ -17,7 +17,7 @@ from ...datasets.views.formats.shots import DepthMap
 from ...datasets.views.images import PosedImage, PosedImages
 from ...neural_fields import Field, InputError, sphere_trace
 from ...neural_fields.backend.devices import handed, uniform
-from ...neural_fields.fields.function import FieldLike
+from ...neural_fields.fields.field import FieldLike
 from ...neural_fields.volume.weights import sphere_span
 from .silhouettes import OBJECT
 

@@ -1,6 +1,9 @@
-"""Fields survive the disk; damaged and foreign files are one clear line."""
+"""Fields, textures and radiances survive the disk; damaged and foreign files are one clear line."""
 
+import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,13 +23,24 @@ from mplicits.neural_fields import (
     Similarity,
     Siren,
     Sphere,
+    TextureField,
     Torus,
     Union,
+    ViewColor,
     load_field,
+    load_texture,
+    render_volume,
     save_field,
 )
+from mplicits.neural_fields.checkpoint import load_radiance, save_radiance, save_texture
 from mplicits.neural_fields.fields.csg import Bounded, Placed
+from mplicits.neural_fields.networks.hash_encoding import HashEncoding
+from mplicits.neural_fields.networks.radiance import Outside, Radiance
+from mplicits.neural_fields.networks.texture import ColorSiren
+from safetensors import safe_open
 from safetensors.torch import save_file
+
+GEOMETRY = Siren(8, 2, num_features=3)
 
 
 @pytest.mark.parametrize(
@@ -73,46 +87,132 @@ def test_similarity_goes_there_and_back() -> None:
 
 def test_a_field_that_cannot_be_described_leaves_nothing(tmp_path: Path) -> None:
     for field in (FunctionField(torch.linalg.vector_norm), Union(Sphere(), FunctionField(torch.linalg.vector_norm))):
-        with pytest.raises(TypeError, match=r"FunctionField cannot be saved.*a mesh of it can"):
+        with pytest.raises(TypeError, match="FunctionField cannot be saved"):
             save_field(tmp_path / "f.safetensors", field)
     assert not list(tmp_path.iterdir())
 
 
-def saved(path: Path) -> Path:
-    save_field(path, Siren(8, 2))
-    return path
+def texture(geometry: Field) -> TextureField:
+    network = ColorSiren(16, 3, omega=4.0)
+    return TextureField(geometry, network, delta=0.15, geometry_level=-1, outside=(0.1, 0.2, 0.3))
 
 
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        load_field(tmp_path / "none.safetensors")
+def test_textures_survive_the_disk(tmp_path: Path, dtype: torch.dtype) -> None:
+    field, path = texture(small_multiscale()).to(dtype), tmp_path / "t.safetensors"
+    save_texture(path, field)
+    save_field(tmp_path / "f.safetensors", field.geometry)
+    geometry = load_field(tmp_path / "f.safetensors").field
+    loaded, x = load_texture(path, geometry), 2 * torch.rand(500, 3, dtype=dtype) - 1
+    assert loaded.geometry is geometry
+    assert loaded.geometry_level == 2
+    assert torch.equal(loaded.value(x), field.value(x))
+    assert torch.equal(loaded.jet(x).gradient, field.jet(x).gradient)
+    assert not any(parameter.requires_grad for parameter in loaded.network.parameters())
+    assert load_texture(path, field.geometry.double()).geometry.like.dtype == torch.float64  # any precision will do
 
 
-def test_truncated_file(tmp_path: Path) -> None:
-    path = saved(tmp_path / "f.safetensors")
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(InputError, match=r"f\.safetensors: damaged"):
-        load_field(path)
+def radiance(*, grid: bool = True, outside: bool = True) -> Radiance:
+    """A small one, of random numbers."""
+    table = {"levels": 3, "table_size": 64, "features": 2, "coarsest": 2, "finest": 9}
+    torch.manual_seed(0)
+    color = ViewColor(3, width=8, depth=1, point_frequencies=2, grid=HashEncoding(**table) if grid else None)
+    around = HashEncoding(**table, extent=2.0) if grid else None
+    behind = Outside(width=6, depth=2, point_frequencies=3, view_frequencies=2, grid=around) if outside else None
+    return Radiance(color, behind, torch.tensor([0.1, 0.2, 0.3]), 123.5)
 
 
-def test_not_safetensors(tmp_path: Path) -> None:
-    path = tmp_path / "f.safetensors"
-    path.write_text("ply\nformat ascii 1.0\n")
-    with pytest.raises(InputError, match="damaged, or not a field"):
-        load_field(path)
+@pytest.mark.parametrize(("grid", "outside"), [(True, True), (False, True), (True, False)])
+def test_rays_see_the_same_before_and_after(grid: bool, outside: bool, tmp_path: Path) -> None:
+    before, path = radiance(grid=grid, outside=outside), tmp_path / "r.safetensors"
+    save_radiance(path, before, GEOMETRY, metadata={"sampling": [1, 2]})
+    after, metadata = load_radiance(path, GEOMETRY)
+    assert metadata == {"sampling": [1, 2]}
+    assert not any(p.requires_grad for p in after.color.parameters())
+    generator = torch.Generator().manual_seed(1)
+    eyes = torch.tensor([[0.0, 0.0, 3.0]]).expand(20, 3)
+    rays = eyes, torch.nn.functional.normalize(0.4 * torch.randn(20, 3, generator=generator) - eyes, dim=1)
+    first, second = (
+        render_volume(GEOMETRY, a.color, *rays, inv_std=a.inv_std, background=a.background, outside=a.outside).color
+        for a in (before, after)
+    )
+    assert torch.equal(first, second)
+    assert float(first.detach().std()) > 0
 
 
-def test_foreign_safetensors(tmp_path: Path) -> None:
-    path = tmp_path / "f.safetensors"
-    save_file({"a": torch.zeros(3)}, path)
-    with pytest.raises(InputError, match="a safetensors file, but not a field"):
-        load_field(path)
+# A kind of file: how one is written, and how it is read.
+KINDS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
+    "field": (lambda path: save_field(path, GEOMETRY), load_field),
+    "texture": (lambda path: save_texture(path, texture(GEOMETRY)), lambda path: load_texture(path, GEOMETRY)),
+    "radiance": (lambda path: save_radiance(path, radiance(), GEOMETRY), lambda path: load_radiance(path, GEOMETRY)),
+}
 
 
-def test_not_finite(tmp_path: Path) -> None:
-    network = Siren(8, 2)
-    with torch.no_grad():
-        network.output.bias.fill_(float("nan"))
-    save_field(tmp_path / "f.safetensors", network)
-    with pytest.raises(InputError, match=r"'output\.bias' has NaN"):
-        load_field(tmp_path / "f.safetensors")
+def rewrite(path: Path, kind: str, place: tuple[str, ...], value: object) -> None:
+    """Replace a value in a file's header, or a tensor by one that is not finite."""
+    with safe_open(path, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        header = json.loads((file.metadata() or {})[f"mplicits-{kind}"])
+    inner: Any = tensors if value is None else header
+    for key in place[:-1]:
+        inner = inner[key]
+    inner[place[-1]] = inner[place[-1]].fill_(torch.nan) if value is None else value
+    if value is None:
+        header.pop("checksum")
+    save_file(tensors, path, metadata={f"mplicits-{kind}": json.dumps(header)})
+
+
+DAMAGES: dict[str, tuple[str, Callable[[Path, str], object]]] = {
+    "missing": ("no such file", lambda path, kind: path.unlink()),
+    "truncated": ("damaged", lambda path, kind: path.write_bytes(path.read_bytes()[:-50])),
+    "not safetensors": ("damaged, or not a", lambda path, kind: path.write_text("ply\nformat ascii 1.0\n")),
+    "foreign": ("a safetensors file, but not a", lambda path, kind: save_file({"a": torch.zeros(3)}, path)),
+    "metadata": ("damaged, or not a", lambda path, kind: rewrite(path, kind, ("metadata",), [1])),
+    "another kind": ("but not a", lambda path, kind: KINDS["texture" if kind == "field" else "field"][0](path)),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_and_foreign_files_are_one_line(damage: str, kind: str, tmp_path: Path) -> None:
+    path, (message, spoil) = tmp_path / "x.safetensors", DAMAGES[damage]
+    KINDS[kind][0](path)
+    KINDS[kind][1](path)
+    spoil(path, kind)
+    with pytest.raises(InputError, match=rf"x\.safetensors: .*{message}") as caught:
+        KINDS[kind][1](path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("kind", "name"), [("field", "output.bias"), ("texture", "network.siren.output.bias")])
+def test_numbers_that_are_not_finite_are_refused(kind: str, name: str, tmp_path: Path) -> None:
+    KINDS[kind][0](tmp_path / "x.safetensors")
+    rewrite(tmp_path / "x.safetensors", kind, (name,), None)
+    with pytest.raises(InputError, match=rf"x\.safetensors: .*{name.removeprefix('network.')}"):
+        KINDS[kind][1](tmp_path / "x.safetensors")
+
+
+@pytest.mark.parametrize("load", [load_texture, load_radiance])
+def test_colours_of_another_geometry_are_refused(load: Callable[[Path, Field], object], tmp_path: Path) -> None:
+    KINDS["texture" if load is load_texture else "radiance"][0](tmp_path / "x.safetensors")
+    with pytest.raises(InputError, match=r"x\.safetensors: .*of another field"):
+        load(tmp_path / "x.safetensors", Siren(8, 2, num_features=3))
+
+
+@pytest.mark.parametrize(
+    ("place", "number"),
+    [
+        (("color", "width"), 10**9),
+        (("color", "depth"), 10**6),
+        (("color", "grid", "levels"), 10**3),
+        (("color", "grid", "levels"), 10**9),
+        (("color", "grid", "table_size"), 3),
+        (("outside", "width"), 7),
+        (("inv_std",), float("nan")),
+        (("outside",), 3),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(place: tuple[str, ...], number: object, tmp_path: Path) -> None:
+    KINDS["radiance"][0](tmp_path / "r.safetensors")
+    rewrite(tmp_path / "r.safetensors", "radiance", place, number)
+    with pytest.raises(InputError, match=r"r\.safetensors: damaged, or not a radiance"):
+        load_radiance(tmp_path / "r.safetensors", GEOMETRY)

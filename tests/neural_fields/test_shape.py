@@ -96,12 +96,6 @@ def test_meshes_lie_where_the_input_was(bounds: tuple[np.ndarray, np.ndarray] | 
     assert mesh.normals is not None
 
 
-@pytest.mark.parametrize("points", [np.zeros((2, 2)), np.float64(1), torch.zeros(4, 2), torch.tensor(1.0)])
-def test_what_are_no_points_is_refused(points: object) -> None:
-    with pytest.raises(ValueError, match=r"expected \(\.\.\., 3\)"):
-        BALL.distance(points)
-
-
 def test_space_time_is_refused_and_a_repr_says_where_it_is() -> None:
     with pytest.raises(ValueError, match="in_dim=4"):
         WorldField(small_spacetime())

@@ -1,4 +1,1 @@
-"""Fused kernels in Triton: whole sweeps of a network in one launch, for CUDA.
-
-`switch` says when they are used, and loads without Triton; the other files are imported when they are, by the fields.
-"""
+"""Fused kernels in Triton for CUDA; only `switch` loads without Triton."""

@@ -1,4 +1,4 @@
-"""Cones for tiles of an image, all of one size in one launch: `mplicits.neural_fields.tracing.cones.cone_starts`."""
+"""Cones for tiles of an image, all of one size in one launch: `tracing.cones.cone_starts`."""
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false, reportAssignmentType=false
@@ -11,33 +11,16 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import launch
+from .launch import half_scratch, launch
 from .packing import Packed
-from .siren import half_scratch
 from .tensor_tiles import keep, rows_of, value_of_tile
-
-__all__ = ["march_cones"]
 
 
 @triton.jit(do_not_specialize=["count", "max_steps"])
 def march(
-    origin,
-    axes,
-    spreads,
-    leaves,
-    depths,
-    margin,
-    free,
-    floats,
-    halves,
-    scratch,
-    count,
-    max_steps,
-    lipschitz,
-    SHAPE: tl.constexpr,
-    SCRATCH: tl.constexpr,
-    ROWS: tl.constexpr,
-):
+    origin, axes, spreads, leaves, depths, margin, free, floats, halves, scratch, count, max_steps, lipschitz,
+    SHAPE: tl.constexpr, SCRATCH: tl.constexpr, ROWS: tl.constexpr,
+):  # fmt: skip
     """Every program marches a tile of cones until all have stopped, then the next of its own."""
     infinite = float("inf")
     own = scratch + tl.cast(tl.program_id(0), tl.int64) * SCRATCH
@@ -80,13 +63,9 @@ def march_cones(
 ) -> Tensor:
     """How far each cone is empty ``(C,)``, infinite where it leaves untouched.
 
-    Args:
-        network: level 0, on the cones' device.
-        cones: their common origin ``(3,)``; of each its axis ``(C, 3)``, its spread ``(C,)``, where it leaves the ball
-            of the surface, and where it begins, infinite for those that never enter.
-        margin: how far they keep from the surface, a number on the same device.
-        lipschitz: see `mplicits.neural_fields.cone_starts`.
-        max_steps: see there.
+    ``cones`` are their common origin ``(3,)``; axes ``(C, 3)``, spreads ``(C,)``, where they leave the ball of the
+    surface, and where they begin, infinite for those that never enter. ``margin`` is their distance from the surface,
+    on the device.
     """
     origin, axes, spreads, leaves, depths = (part.contiguous() for part in cones)
     free = torch.empty_like(depths)

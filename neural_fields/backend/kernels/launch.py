@@ -1,4 +1,4 @@
-"""What every launch needs: how a network is cut into tiles, how many programs there are, and their scratch."""
+"""Common to all launches: tiles of a network, number of programs, and their scratch."""
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
@@ -13,40 +13,20 @@ import torch
 import triton
 from torch import Tensor
 
-__all__ = [
-    "Network",
-    "Tiling",
-    "launch",
-    "multiprocessors",
-    "on_device",
-    "program_count",
-    "resident_programs",
-    "scratch_for",
-    "tiling_of",
-]
-
-# Of a multiprocessor, of compute capability 8.0 and later: registers; and of a warp, threads.
-REGISTERS, WARP = 1 << 16, 32
-# The interpreter runs one after the other; three show what several do.
-INTERPRETED_PROGRAMS = 3
+REGISTERS, WARP = 1 << 16, 32  # of a multiprocessor of compute capability 8.0 and later; threads of a warp
+INTERPRETED_PROGRAMS = 3  # run in turn by the interpreter
 
 
 class Network(NamedTuple):
-    """A SIREN as the kernels take it.
+    """A SIREN for the kernels."""
 
-    Attributes:
-        parameters: (W₁, b₁, …, W_d, b_d, W_out, b_out), contiguous, float32; of the output the first row is read.
-        omega: ω₀ times the unit of the sine layers' parameters.
-        gain: the unit of the output's.
-    """
-
-    parameters: tuple[Tensor, ...]
-    omega: float
-    gain: float
+    parameters: tuple[Tensor, ...]  # (W₁, b₁, …, W_out, b_out), contiguous, float32; one output row is read
+    omega: float  # ω₀ times the unit of the sine layers' parameters
+    gain: float  # the unit of the output's
 
     @classmethod
     def of(cls, parameters: Sequence[Tensor], omega: float, gain: float) -> Network:
-        """With whatever is not contiguous copied."""
+        """A network of contiguous, detached parameters."""
         return cls(tuple(parameter.detach().contiguous() for parameter in parameters), float(omega), float(gain))
 
     @property
@@ -56,24 +36,17 @@ class Network(NamedTuple):
 
     @property
     def depth(self) -> int:
-        """How many sine layers there are."""
+        """Number of sine layers."""
         return len(self.parameters) // 2 - 1
 
 
 class Tiling(NamedTuple):
-    """How a kernel cuts its work; the names are those of its arguments.
+    """How a kernel cuts its work; the names are those of its arguments."""
 
-    Attributes:
-        rows: points of a tile.
-        columns: units of an accumulator, a power of two.
-        piece: inner units of one product, a power of two ≥ 16.
-        warps: of a program.
-    """
-
-    rows: int
-    columns: int
-    piece: int
-    warps: int
+    rows: int  # points of a tile
+    columns: int  # units of an accumulator, a power of two
+    piece: int  # inner units of one product, a power of two ≥ 16
+    warps: int  # of a program
 
     def stride(self, width: int) -> int:
         """The width rounded up to whole accumulators."""
@@ -89,7 +62,7 @@ def tiling_of(width: int) -> Tiling:
 
 
 def program_count(device: torch.device, tiles: int) -> int:
-    """How many programs share ``tiles``: at least 1, and as many as run at a time."""
+    """Programs that share ``tiles``: at least 1, and as many as run at a time."""
     if device.type != "cuda":
         return max(1, min(tiles, INTERPRETED_PROGRAMS))
     # By their registers two run beside each other; of the jet of 128 units one, and the other comes after it.
@@ -102,12 +75,17 @@ def multiprocessors(device: torch.device) -> int:
 
 
 def scratch_for(x: Tensor, programs: int, floats: int) -> Tensor:
-    """Memory that ``programs`` programs write ``floats`` numbers into each, with nothing in it yet."""
+    """Uninitialised memory of ``floats`` numbers for each of ``programs`` programs."""
     return torch.empty(programs * floats, dtype=torch.float32, device=x.device)
 
 
+def half_scratch(like: Tensor, numbers: int) -> Tensor:
+    """Uninitialised memory for ``numbers`` float16 numbers, at least one."""
+    return torch.empty(max(1, numbers), dtype=torch.float16, device=like.device)
+
+
 def on_device(x: Tensor) -> contextlib.AbstractContextManager[object]:
-    """Triton launches on the current device; make it that of ``x``."""
+    """Make the device of ``x`` current, on which Triton launches."""
     return torch.cuda.device(x.device) if x.is_cuda else contextlib.nullcontext()
 
 
@@ -126,21 +104,11 @@ def launch(
     registers: int | None = None,
     **constants: Any,
 ) -> None:
-    """Launch as many programs of a kernel as the device holds at a time, and no more than there are ``tiles``.
+    """Launch as many programs of a kernel as the device holds at a time, at most ``tiles`` ≥ 1.
 
-    How many a multiprocessor holds follows from the registers and the shared memory of the compiled kernel. The first
-    launch, which compiles it, has one program for each.
-
-    Args:
-        kernel: of Triton.
-        like: a tensor on the device.
-        tiles: pieces of work, at least 1.
-        arguments: from the number of programs to the kernel's arguments.
-        warps: of a program.
-        stages: depth of the pipeline of loads in loops.
-        registers: most of them that a thread may take, so that more programs run at a time; None for the compiler's
-            choice.
-        constants: what the kernel is compiled for.
+    How many a multiprocessor holds follows from the registers and shared memory of the compiled kernel; the first
+    launch, which compiles it, has one for each. ``arguments`` maps the number of programs to the kernel's arguments,
+    ``registers`` limits those of a thread, so that more programs run at a time, and ``constants`` are compiled in.
     """
     options = {**constants, "num_warps": warps, "num_stages": stages}
     if registers is not None and like.is_cuda:
@@ -160,14 +128,7 @@ def launch(
 
 
 def resident_programs(registers: int, shared: int, warps: int, properties: Any) -> int:
-    """Programs that one multiprocessor holds at a time.
-
-    Args:
-        registers: of a thread.
-        shared: bytes of a program.
-        warps: of a program.
-        properties: of the device, as PyTorch gives them.
-    """
+    """Programs that one multiprocessor holds: ``registers`` of a thread, ``shared`` bytes of a program."""
     by_registers = REGISTERS // (-(-registers // 8) * 8 * WARP * warps)
     # The driver keeps 1 KiB of shared memory for each program.
     by_shared = properties.shared_memory_per_multiprocessor // (shared + (1 << 10))

@@ -1,9 +1,8 @@
-"""All levels of a `MultiscaleSDF` in one launch: value, or value and gradient, with the gates decided inside.
+"""All levels of a `MultiscaleSDF` in one launch: value, or value and gradient, with the gates evaluated inside.
 
-Each program evaluates level 0 on its tiles, and puts the rows that lie in the band on a list of its own, in order. Then
-it evaluates the next level on the list, ROWS at a time, adds it behind its gate, and keeps the rows that lie in the
-next band; and so on. So a level costs what the rows in its band cost, rounded up to one tile for each program. No other
-program and no host has to know how many there are.
+Each program evaluates level 0 on its tiles, and lists the rows in the band, in order. Then it evaluates the next level
+on the list, ROWS at a time, adds it behind its gate, and keeps the rows in the next band; and so on. So a level costs
+what the rows in its band cost, rounded up to one tile for each program.
 
 With f the value so far, δ the half-width of the band, τ the taper and r the next level, as in `multiscale.py`:
 
@@ -26,35 +25,26 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import launch
+from .launch import half_scratch, launch
 from .packing import Packed, Shape
-from .siren import half_scratch
 from .tensor_tiles import jet_of_tile, points_of, rows_of, value_of_tile
-
-__all__ = ["Levels", "gate_of", "level_of_tile", "levels_jet", "levels_value", "walk_rows"]
 
 
 class Levels(NamedTuple):
-    """A `MultiscaleSDF` as the kernels take it.
+    """A `MultiscaleSDF` for the kernels."""
 
-    Attributes:
-        networks: coarse to fine.
-        deltas: ``(len(networks) − 1,)`` half-widths of the bands, float32 on the networks' device.
-        taper: the share of a band over which its gate closes.
-    """
-
-    networks: tuple[Packed, ...]
-    deltas: Tensor
-    taper: float
+    networks: tuple[Packed, ...]  # coarse to fine
+    deltas: Tensor  # (len(networks) − 1,) half-widths of the bands, float32 on the networks' device
+    taper: float  # share of a band over which its gate closes
 
     @classmethod
     def of(cls, networks: Sequence[Packed], deltas: Tensor, taper: float) -> Levels:
-        """Up to as many levels as there are ``networks``."""
+        """The levels of ``networks``, with as many bands as they need."""
         return cls(tuple(networks), deltas[: len(networks) - 1].to(torch.float32).contiguous(), float(taper))
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """What kernels are compiled for, of each level."""
+        """Compile-time shape of each level."""
         return tuple(tuple(network.shape) for network in self.networks)
 
     def arguments(self) -> tuple[object, ...]:
@@ -75,17 +65,10 @@ class Levels(NamedTuple):
 @triton.jit
 def level_of_tile(
     LEVEL: tl.constexpr,
-    points,
-    floats,
-    halves,
-    kept,
-    scratch,
-    JET: tl.constexpr,
-    SHAPES: tl.constexpr,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-):
-    """One level of a tile: its value, and its gradient as a tuple of columns, which is empty unless ``JET``."""
+    points, floats, halves, kept, scratch,
+    JET: tl.constexpr, SHAPES: tl.constexpr, ROWS: tl.constexpr, IN: tl.constexpr,
+):  # fmt: skip
+    """Value of one level of a tile, and its gradient as a tuple of columns, empty unless ``JET``."""
     SHAPE: tl.constexpr = SHAPES[LEVEL]
     if JET:
         return jet_of_tile(points, floats[LEVEL], halves[LEVEL], scratch, SHAPE, ROWS, IN)
@@ -107,7 +90,7 @@ def gate_of(f, delta, taper, TAPERED: tl.constexpr):
 
 @triton.jit
 def append(entries, length, entry, chosen):
-    """Put the ``chosen`` of a tile of entries on a list, in order → its new length."""
+    """Append the ``chosen`` of a tile of entries to a list, in order → its new length."""
     place = length + tl.cumsum(chosen.to(tl.int32), axis=0) - 1
     tl.store(entries + place, entry, mask=chosen)
     return length + tl.sum(chosen.to(tl.int32), axis=0)
@@ -115,26 +98,10 @@ def append(entries, length, entry, chosen):
 
 @triton.jit(do_not_specialize=["room"])
 def walk(
-    x,
-    wanted,
-    floats,
-    halves,
-    deltas,
-    value,
-    gradient,
-    lists,
-    scratch,
-    counted,
-    room,
-    taper,
-    JET: tl.constexpr,
-    WANTED: tl.constexpr,
-    TAPERED: tl.constexpr,
-    SHAPES: tl.constexpr,
-    SCRATCH: tl.constexpr,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-):
+    x, wanted, floats, halves, deltas, value, gradient, lists, scratch, counted, room, taper,
+    JET: tl.constexpr, WANTED: tl.constexpr, TAPERED: tl.constexpr, SHAPES: tl.constexpr, SCRATCH: tl.constexpr,
+    ROWS: tl.constexpr, IN: tl.constexpr,
+):  # fmt: skip
     """Every program takes tiles from its own number on, and has a list with ``room`` for all their rows."""
     LEVELS: tl.constexpr = len(SHAPES)
     program = tl.cast(tl.program_id(0), tl.int64)
@@ -184,20 +151,14 @@ def walk(
 
 
 def levels_value(x: Tensor, levels: Levels, wanted: Tensor | None = None) -> Tensor:
-    """The finest level at points ``(N, d)`` → ``(N,)``; N may be 0.
-
-    Args:
-        x: float32, on a CUDA device, or on the CPU under the interpreter.
-        levels: two or more, on the same.
-        wanted: ``(N,)`` bool, the points that are let into bands; None for all.
-    """
+    """The finest of two or more levels at float32 points ``(N, d)`` → ``(N,)``; bands admit ``wanted`` only."""
     value = x.new_empty(len(x))
     walk_rows(x, levels, value, value, wanted, jet=False)
     return value
 
 
 def levels_jet(x: Tensor, levels: Levels, wanted: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """The finest level and its gradient at ``(N, d)`` → ``(N,)``, ``(N, d)``; for the arguments see `levels_value`."""
+    """The finest level and its gradient at ``(N, d)`` → ``(N,)``, ``(N, d)``; see `levels_value`."""
     value, gradient = x.new_empty(len(x)), x.new_empty(x.shape)
     walk_rows(x, levels, value, gradient, wanted, jet=True)
     return value, gradient
@@ -213,16 +174,9 @@ def walk_rows(
     *,
     jet: bool,
 ) -> None:
-    """Write values, and with ``jet`` gradients, of the first rows of ``x``.
+    """Write values ``(N,)``, and with ``jet`` gradients ``(N, d)``, of the first rows of ``x`` ``(N, d)``.
 
-    Args:
-        x: ``(N, d)``.
-        levels: one or more.
-        value: ``(N,)``, written.
-        gradient: ``(N, d)``, written with ``jet``.
-        wanted: see `levels_value`.
-        count: how many rows, an integer tensor on the device; None for all.
-        jet: whether gradients are made.
+    ``count`` is the number of rows, an integer tensor on the device, or None for all.
     """
     if not len(x):
         return

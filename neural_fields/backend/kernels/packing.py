@@ -20,39 +20,26 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-__all__ = ["LARGEST_WEIGHT", "SINES", "Packed", "Shape", "Weights", "is_hopper", "pack", "packed", "state_of"]
-
-# Sines are multiplied by this before they are split: a power of two, so that their low halves are normal numbers.
-SINES = 1024.0
-# The largest entry of a scaled matrix lies in (LARGEST_WEIGHT / 2, LARGEST_WEIGHT].
-LARGEST_WEIGHT = 16.0
+SINES = 1024.0  # factor of sines before they are split, a power of two: their low halves are normal numbers
+LARGEST_WEIGHT = 16.0  # the largest entry of a scaled matrix lies in (LARGEST_WEIGHT / 2, LARGEST_WEIGHT]
 
 
 class Shape(NamedTuple):
-    """What a kernel is compiled for.
+    """Compile-time shape of a network."""
 
-    Attributes:
-        width: units of a sine layer, padded with zeros to a multiple of an accumulator.
-        depth: sine layers.
-        columns: units of an accumulator, a power of two in 16 to 256.
-        piece: inner units of one product, a power of two in 16 to 64.
-        rows: points of a tile.
-        kept: whether a program that evaluates values keeps the hidden weights in shared memory.
-    """
-
-    width: int
-    depth: int
-    columns: int
-    piece: int
-    rows: int
-    kept: bool
+    width: int  # units of a sine layer, padded with zeros to a multiple of an accumulator
+    depth: int  # sine layers
+    columns: int  # units of an accumulator, a power of two in 16 to 256
+    piece: int  # inner units of one product, a power of two in 16 to 64
+    rows: int  # points of a tile
+    kept: bool  # whether a program that evaluates values keeps the hidden weights in shared memory
 
     @classmethod
     def of(cls, width: int, depth: int, *, hopper: bool = True) -> Shape:
         """One accumulator up to 128 units, or on Hopper 256; accumulators of 128 beyond.
 
         Only Hopper's products take their second operand from shared memory, and leave registers for 256 units. Above
-        128 units the weights of a level do not stay in shared memory; there twice as many points share them.
+        128 units the weights of a level do not stay in shared memory; twice as many points share them.
         """
         kept_width = 128  # two halves of such a matrix, 64 KiB, fit the shared memory of a program
         columns = max(16, 1 << (width - 1).bit_length())
@@ -69,7 +56,7 @@ class Shape(NamedTuple):
         return self.depth == 1 or (self.depth == 2 and self.width == self.columns)
 
     def scratch(self, rows: int, *, jet: bool) -> int:
-        """How many float16 numbers a program keeps in scratch for a tile of ``rows`` points."""
+        """Float16 numbers in a program's scratch for a tile of ``rows`` points."""
         if self.direct:
             return 0
         return 2 * rows * self.width * (2 + max(0, self.depth - 2) * jet)
@@ -78,13 +65,11 @@ class Shape(NamedTuple):
 class Packed(NamedTuple):
     """A SIREN for the kernels.
 
-    Attributes:
-        floats: float32, in rows of ``shape.width``: of the first layer one for each coordinate and one of biases; the
-            biases of the other sine layers; the output's weights, and these scaled for the sweep back. Then numbers:
-            the output's bias, (2π)^depth, and of each hidden layer what its products are multiplied by, there and back.
-            Phases are in turns, and the output's gain is included.
-        halves: float16 ``(depth − 1, 2, width, width)``: H and L of each hidden layer; rows are inner units.
-        shape: see `Shape`.
+    ``floats`` are float32, in rows of ``shape.width``: of the first layer one for each coordinate and one of biases;
+    the biases of the other sine layers; the output's weights, and these scaled for the sweep back. Then numbers: the
+    output's bias, (2π)^depth, and of each hidden layer the factors of its products, there and back. Phases are in
+    turns, the output's gain is included. ``halves``, float16 ``(depth − 1, 2, width, width)``, are H and L of each
+    hidden layer; rows are inner units.
     """
 
     floats: Tensor
@@ -96,10 +81,7 @@ class Packed(NamedTuple):
 def pack(parameters: Sequence[Tensor], omega: float, gain: float) -> Packed:
     """Pack a SIREN by a few dozen small operations on its device, none of which waits.
 
-    Args:
-        parameters: (W₁, b₁, …, W_d, b_d, W_out, b_out); of the output the first row is used.
-        omega: factor of the phases, ω₀ times the unit of the sine layers' parameters.
-        gain: factor of the output.
+    ``omega`` is ω₀ times the unit of the sine layers' parameters, ``gain`` the factor of the output.
     """
     turns = omega / (2 * math.pi)
     width = len(parameters[0])
@@ -136,7 +118,7 @@ def pack(parameters: Sequence[Tensor], omega: float, gain: float) -> Packed:
 
 @functools.cache
 def is_hopper(device: torch.device) -> bool:
-    """Whether a device has compute capability 9; the interpreter is taken for one that has."""
+    """Whether a device has compute capability 9; true for the interpreter."""
     return device.type != "cuda" or torch.cuda.get_device_capability(device)[0] == 9
 
 
@@ -147,7 +129,7 @@ def power_of_two(target: float, like: Tensor) -> Tensor:
 
 
 class Weights(Protocol):
-    """What is asked of a `Siren`: its parameters, and what phases and outputs are multiplied by."""
+    """Interface of a `Siren`: its parameters and their units."""
 
     omega: float
     units: tuple[float, float]
@@ -171,8 +153,8 @@ def state_of(network: Weights) -> tuple[object, ...]:
 def packed(network: Weights) -> Packed:
     """A SIREN's weights for the kernels; packed again, into the same memory, when they have changed.
 
-    Changes are known by PyTorch's version counters, which changes through ``.data`` and CUDA graphs do not count: after
-    those, call ``torch.autograd.graph.increment_version(parameters)``.
+    Changes are known by PyTorch's version counters. After changes through ``.data`` or CUDA graphs, call
+    ``torch.autograd.graph.increment_version(parameters)``.
     """
     state, before = state_of(network), _kept.get(network)
     if before is not None and before[0] == state:

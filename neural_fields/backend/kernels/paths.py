@@ -2,11 +2,9 @@
 
 Each program has SLOTS places for rays, a ring of free ones, and for each level a ring of those that wait for its value.
 Free places take the next rays of a queue that all programs share. A program serves its longest ring, up to ROWS rays at
-a time. A value in the next band sends its ray to the ring of the next level. Any other goes through `rules.py`, after
-which the ray has ended or goes back to the ring of level 0. So tiles of every level are full as long as there are rays
-enough. The state of rays lies in a scratch of the program's own, small enough for caches.
-
-The rules are those of `sphere_trace` without expectations; see `tracing.py`.
+a time: a value in the next band sends its ray to the ring of the next level; any other goes through `look_at`, after
+which the ray has ended or goes back to level 0. So tiles of every level stay full. The state of rays lies in a scratch
+of the program's own. The rules are those of `sphere_trace` without expectations; see `tracing.py`.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -21,23 +19,18 @@ import triton.language as tl
 from torch import Tensor
 
 from . import tracing
-from .launch import launch
+from .launch import half_scratch, launch
 from .levels import Levels, gate_of, level_of_tile
-from .rules import first_band, look_at, turned_back
-from .siren import half_scratch
 from .tensor_tiles import keep
-from .tracing import Marched, Queue, RayTensors
+from .tracing import Marched, Queue, RayTensors, first_band, look_at, turned_back
 
-__all__ = ["march_fused", "march_levels"]
-
-# Rays under way in a program: more of them fill the tiles, and fewer leave later rays for the end, when the last ones
-# are on their way. Twice as many above so many rays in all.
+# Rays under way in a program: more fill the tiles, fewer shorten the end. Twice as many above MANY_RAYS rays in all.
 SLOTS, MANY_RAYS = 256, 1 << 19
 
 
 @triton.jit
 def added(numbers, INDEX: tl.constexpr, number, LEVELS: tl.constexpr):
-    """A tuple of numbers with one of them more by ``number``."""
+    """A tuple of numbers with ``number`` added to one of them."""
     result = ()
     for level in tl.static_range(LEVELS):
         if level == INDEX:  # noqa: SIM108  only the chosen branch is compiled
@@ -57,41 +50,13 @@ def put(rings, heads, lengths, INDEX: tl.constexpr, entry, chosen, place, SLOTS:
 @triton.jit
 def serve(
     LEVEL: tl.constexpr,
-    heads,
-    lengths,
-    weights,
-    origins,
-    directions,
-    entries,
-    ends,
-    floats,
-    halves,
-    deltas,
-    found_mask,
-    found_depth,
-    found_steps,
-    found_slope,
-    found_level,
-    kept,
-    rings,
-    scratch,
-    tolerance,
-    resolution,
-    lipschitz,
-    max_steps,
-    taper,
-    PATIENCE: tl.constexpr,
-    BOLDNESS: tl.constexpr,
-    STEEPEST_RISE: tl.constexpr,
-    BAND_ENTRY: tl.constexpr,
-    FLOOR: tl.constexpr,
-    ORIGIN: tl.constexpr,
-    TAPERED: tl.constexpr,
-    SHAPES: tl.constexpr,
-    SLOTS: tl.constexpr,
+    heads, lengths, weights, origins, directions, entries, ends, floats, halves, deltas, found_mask, found_depth,
+    found_steps, found_slope, found_level, kept, rings, scratch, tolerance, resolution, lipschitz, max_steps, taper,
+    PATIENCE: tl.constexpr, BOLDNESS: tl.constexpr, STEEPEST_RISE: tl.constexpr, BAND_ENTRY: tl.constexpr,
+    FLOOR: tl.constexpr, ORIGIN: tl.constexpr, TAPERED: tl.constexpr, SHAPES: tl.constexpr, SLOTS: tl.constexpr,
     ROWS: tl.constexpr,
-):
-    """Evaluate a level on the first rays of its ring, and see where each goes → the rings' heads and lengths."""
+):  # fmt: skip
+    """Evaluate a level on the first rays of its ring, and route each → the rings' heads and lengths."""
     LEVELS: tl.constexpr = len(SHAPES)
     rays = rings + SLOTS * (LEVELS + 1)
     taken = rays + SLOTS
@@ -182,41 +147,12 @@ def serve(
 
 @triton.jit(do_not_specialize=["max_steps"])
 def march_bands(
-    origins,
-    directions,
-    starts,
-    entries,
-    ends,
-    listed,
-    queue,
-    floats,
-    halves,
-    deltas,
-    found_mask,
-    found_depth,
-    found_steps,
-    found_slope,
-    found_level,
-    columns,
-    counts,
-    scratch,
-    numbers,
-    max_steps,
-    taper,
-    PATIENCE: tl.constexpr,
-    BOLDNESS: tl.constexpr,
-    STEEPEST_RISE: tl.constexpr,
-    BAND_ENTRY: tl.constexpr,
-    FLOOR: tl.constexpr,
-    ORIGIN: tl.constexpr,
-    TAPERED: tl.constexpr,
-    SHAPES: tl.constexpr,
-    SCRATCH: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    COUNTS: tl.constexpr,
-    SLOTS: tl.constexpr,
-    ROWS: tl.constexpr,
-):
+    origins, directions, starts, entries, ends, listed, queue, floats, halves, deltas, found_mask, found_depth,
+    found_steps, found_slope, found_level, columns, counts, scratch, numbers, max_steps, taper,
+    PATIENCE: tl.constexpr, BOLDNESS: tl.constexpr, STEEPEST_RISE: tl.constexpr, BAND_ENTRY: tl.constexpr,
+    FLOOR: tl.constexpr, ORIGIN: tl.constexpr, TAPERED: tl.constexpr, SHAPES: tl.constexpr, SCRATCH: tl.constexpr,
+    COLUMNS: tl.constexpr, COUNTS: tl.constexpr, SLOTS: tl.constexpr, ROWS: tl.constexpr,
+):  # fmt: skip
     """March all rays of a queue; ``numbers`` are the tolerance, the resolution and the Lipschitz constant."""
     LEVELS: tl.constexpr = len(SHAPES)
     infinite = float("inf")
@@ -303,7 +239,7 @@ def march_fused(
     max_steps: int,
     constants: dict[str, float],
 ) -> None:
-    """`march_rays` for one network that leaves registers enough for rays, `march_levels` for all others."""
+    """`march_rays` for one network that leaves registers for rays, `march_levels` for all others."""
     alone = len(levels.networks) == 1 and levels.networks[0].shape.width <= tracing.IN_REGISTERS
     march = tracing.march_rays if alone else march_levels
     march(levels, rays, queue, found, numbers, max_steps=max_steps, constants=constants)

@@ -5,34 +5,21 @@
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import launch
+from .launch import half_scratch, launch
 from .packing import Packed
 from .tensor_tiles import jet_of_tile, keep, points_of, rows_of, value_of_tile
-
-__all__ = ["half_scratch", "siren_jet", "siren_value"]
 
 
 @triton.jit(do_not_specialize=["count"])
 def evaluate(
-    x,
-    floats,
-    halves,
-    value,
-    gradient,
-    scratch,
-    count,
-    JET: tl.constexpr,
-    SHAPE: tl.constexpr,
-    SCRATCH: tl.constexpr,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-):
-    """Every program takes tiles from its own number on, in steps of how many programs there are."""
+    x, floats, halves, value, gradient, scratch, count,
+    JET: tl.constexpr, SHAPE: tl.constexpr, SCRATCH: tl.constexpr, ROWS: tl.constexpr, IN: tl.constexpr,
+):  # fmt: skip
+    """Every program takes tiles from its own number on, in steps of the number of programs."""
     own = scratch + tl.program_id(0).to(tl.int64) * SCRATCH
     kept = ()
     if not JET:
@@ -51,27 +38,17 @@ def evaluate(
 
 
 def siren_value(x: Tensor, network: Packed) -> Tensor:
-    """F at points ``(N, d)`` → ``(N,)``; N may be 0.
-
-    Args:
-        x: float32, on a CUDA device, or on the CPU under the interpreter.
-        network: on the same.
-    """
+    """F at float32 points ``(N, d)`` → ``(N,)``; N may be 0."""
     value = x.new_empty(len(x))
     _launch(x, network, value, value, jet=False)
     return value
 
 
 def siren_jet(x: Tensor, network: Packed) -> tuple[Tensor, Tensor]:
-    """F and its gradient at points ``(N, d)`` → ``(N,)``, ``(N, d)``; for the arguments see `siren_value`."""
+    """F and its gradient at points ``(N, d)`` → ``(N,)``, ``(N, d)``."""
     value, gradient = x.new_empty(len(x)), x.new_empty(x.shape)
     _launch(x, network, value, gradient, jet=True)
     return value, gradient
-
-
-def half_scratch(like: Tensor, numbers: int) -> Tensor:
-    """Memory for so many float16 numbers, at least one, with nothing in it yet."""
-    return torch.empty(max(1, numbers), dtype=torch.float16, device=like.device)
 
 
 def _launch(x: Tensor, network: Packed, value: Tensor, gradient: Tensor, *, jet: bool) -> None:
@@ -83,15 +60,7 @@ def _launch(x: Tensor, network: Packed, value: Tensor, gradient: Tensor, *, jet:
         evaluate,
         x,
         triton.cdiv(len(x), rows),
-        lambda programs: (
-            x,
-            network.floats,
-            network.halves,
-            value,
-            gradient,
-            half_scratch(x, programs * kept),
-            len(x),
-        ),
+        lambda programs: (x, network.floats, network.halves, value, gradient, half_scratch(x, programs * kept), len(x)),
         JET=jet,
         SHAPE=tuple(network.shape),
         SCRATCH=kept,

@@ -1,13 +1,11 @@
-"""Whether a network is evaluated by the fused kernels or by PyTorch, and why not by the other.
+"""Whether a network is evaluated by the fused kernels or by PyTorch, and why. This file does not import Triton.
 
 They are used wherever they can be: float32 on CUDA, with Triton there (``pip install 'mplicits[kernels]'``; PyTorch's
-builds for CUDA bring it). The environment variable ``MPLICITS_KERNELS`` says otherwise:
+builds for CUDA bring it). The environment variable ``MPLICITS_KERNELS`` overrides that:
 
     auto       the kernels where they can be used (the default)
     off        PyTorch everywhere
-    interpret  the kernels on the CPU too, by Triton's interpreter, which TRITON_INTERPRET=1 has to switch on: for tests
-
-This file does not import Triton.
+    interpret  the kernels on the CPU too, by Triton's interpreter (needs TRITON_INTERPRET=1): for tests
 """
 
 from __future__ import annotations
@@ -22,34 +20,21 @@ from torch import Tensor
 
 from ..errors import InputError
 
-__all__ = ["MAX_DEPTH", "MAX_LEVELS", "MAX_WIDTH", "MODES", "VARIABLE", "Choice", "choose", "mode", "obstacle"]
-
 VARIABLE = "MPLICITS_KERNELS"
 MODES = ("auto", "off", "interpret")
-# What is tested; wider and deeper ones would run, and keep more in scratch than caches hold.
-MAX_WIDTH, MAX_DEPTH = 512, 8
-# A kernel over levels has the code of each; compiling takes some seconds for one of them.
-MAX_LEVELS = 4
+MAX_WIDTH, MAX_DEPTH = 512, 8  # as tested; larger networks would keep more in scratch than caches hold
+MAX_LEVELS = 4  # a kernel over levels has the code of each, which takes seconds to compile
 
 
 class Choice(NamedTuple):
-    """How a network will be evaluated.
-
-    Attributes:
-        fused: whether the kernels evaluate it.
-        reason: why PyTorch does; empty where the kernels do.
-    """
+    """Whether the kernels evaluate a network (``fused``), and if not, the ``reason``."""
 
     fused: bool
     reason: str
 
 
 def mode() -> str:
-    """What ``MPLICITS_KERNELS`` says.
-
-    Raises:
-        InputError: it says something else.
-    """
+    """Value of ``MPLICITS_KERNELS``; InputError if it is none of `MODES`."""
     said = os.environ.get(VARIABLE, "auto")
     if said not in MODES:
         raise InputError(f"{VARIABLE}={said!r} in the environment: expected one of {', '.join(MODES)}")
@@ -57,17 +42,9 @@ def mode() -> str:
 
 
 def choose(x: Tensor, *, width: int, depth: int, features: int = 0, levels: int = 1) -> Choice:
-    """How a SIREN, or several of them in one launch, is to be evaluated at points ``x`` without a graph.
+    """How a SIREN, or several in one launch, is evaluated at points ``x`` without a graph.
 
-    Args:
-        x: the points.
-        width: of its sine layers; of several, the largest.
-        depth: how many it has; likewise.
-        features: how many outputs beside the value are asked for.
-        levels: how many SIRENs; only level by level where they are more than `MAX_LEVELS`.
-
-    Raises:
-        InputError: see `mode`.
+    ``width`` and ``depth`` are the largest of all; ``features`` is the number of outputs asked for beside the value.
     """
     asked = mode()
     reason = ""

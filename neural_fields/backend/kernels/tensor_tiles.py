@@ -1,20 +1,20 @@
 """Value, or value and gradient, of a tile of points on tensor cores.
 
 A tile is a matrix of ROWS points. A product of matrices is three of float16 with sums in float32: both operands are
-split into a high and a low half. The product of the low ones, about 2⁻²² of a term, is left out. So values and
+split into a high and a low half, and the product of the low ones, about 2⁻²² of a term, is left out. So values and
 gradients have the error of float32.
 
 The first sine layer is made from the points, piece by piece, as the product with the second one needs it. The last one
 goes from its accumulator into the output's sum. Layers between them, and all layers of networks wider than one
-accumulator, lie as halves in a scratch of the program's own. Layer i is in plane i mod 2; behind these two planes are
-the cosines of the layers between first and last. See `packing.py` for the weights.
+accumulator, lie as halves in a scratch of the program's own: layer i in plane i mod 2, behind these the cosines of the
+layers between first and last. See `packing.py` for the weights.
 
 Arguments that functions have in common:
     points: the coordinates, a tuple of IN columns (ROWS,).
-    floats, halves: see `mplicits.neural_fields.backend.kernels.packing.Packed`.
+    floats, halves: see `Packed`.
     scratch: float16 pointer to what the program may write; see `Shape.scratch`.
-    kept: of the hidden matrix its halves, from `keep`, which stay in shared memory; or ().
-    SHAPE: `mplicits.neural_fields.backend.kernels.packing.Shape`, as a tuple.
+    kept: halves of the hidden matrix from `keep`, which stay in shared memory; or ().
+    SHAPE: `Shape` as a tuple.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -26,8 +26,6 @@ import triton
 import triton.language as tl
 
 from .packing import SINES
-
-__all__ = ["jet_of_tile", "keep", "points_of", "rows_of", "sine", "sine_cosine", "value_of_tile"]
 
 # sin 2πq on [−¼, ¼] as the odd polynomial of degree 9 with the smallest largest error, 3.3e-9 (Remez exchange).
 C1 = tl.constexpr(6.283185005187988)
@@ -117,7 +115,7 @@ def _first_turns(points, floats, unit, WIDTH: tl.constexpr, IN: tl.constexpr):
 
 @triton.jit
 def keep(halves, SHAPE: tl.constexpr):
-    """The halves of the only hidden matrix, loaded before a loop, which the compiler keeps in shared memory; or ()."""
+    """The halves of the only hidden matrix, loaded before a loop so that they stay in shared memory; or ()."""
     WIDTH: tl.constexpr = SHAPE[0]
     KEPT: tl.constexpr = SHAPE[5]
     if KEPT:
@@ -143,7 +141,7 @@ def _kept_turns(points, floats, kept, ROWS: tl.constexpr, IN: tl.constexpr, WIDT
 
 @triton.jit
 def _store_halves(plane, cell, h, LOW: tl.constexpr):
-    """Put the halves of a matrix aside, the low one LOW numbers behind the high one."""
+    """Store the halves of a matrix, the low one LOW numbers behind the high one."""
     high, low = halves_of(h)
     tl.store(plane + cell, high)
     tl.store(plane + LOW + cell, low)
@@ -164,19 +162,10 @@ def _add_product(z, high, low, matrix, inner, unit, WIDTH: tl.constexpr, BACK: t
 
 @triton.jit
 def _product(
-    points,
-    plane,
-    floats,
-    matrix,
-    unit,
-    FROM_POINTS: tl.constexpr,
-    BACK: tl.constexpr,
-    ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    PIECE: tl.constexpr,
-):
+    points, plane, floats, matrix, unit,
+    FROM_POINTS: tl.constexpr, BACK: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr, IN: tl.constexpr,
+    WIDTH: tl.constexpr, PIECE: tl.constexpr,
+):  # fmt: skip
     """The scaled product of a layer with a matrix for some units; the layer is made from the points, or in a plane."""
     row = tl.arange(0, ROWS)
     z = tl.zeros((ROWS, COLUMNS), tl.float32)
@@ -193,16 +182,9 @@ def _product(
 
 @triton.jit
 def _turns(
-    points,
-    floats,
-    halves,
-    scratch,
-    unit,
-    LAYER: tl.constexpr,
-    SHAPE: tl.constexpr,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-):
+    points, floats, halves, scratch, unit,
+    LAYER: tl.constexpr, SHAPE: tl.constexpr, ROWS: tl.constexpr, IN: tl.constexpr,
+):  # fmt: skip
     """Phases of some units of a layer, counted from 0, whose layer below is kept or made from the points."""
     WIDTH: tl.constexpr = SHAPE[0]
     DEPTH: tl.constexpr = SHAPE[1]
@@ -231,15 +213,9 @@ def _turns(
 
 @triton.jit
 def value_of_tile(
-    points,
-    floats,
-    halves,
-    kept,
-    scratch,
-    SHAPE: tl.constexpr,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-):
+    points, floats, halves, kept, scratch,
+    SHAPE: tl.constexpr, ROWS: tl.constexpr, IN: tl.constexpr,
+):  # fmt: skip
     """F of a tile, (ROWS,)."""
     WIDTH: tl.constexpr = SHAPE[0]
     DEPTH: tl.constexpr = SHAPE[1]
@@ -271,14 +247,9 @@ def value_of_tile(
 
 @triton.jit
 def jet_of_tile(
-    points,
-    floats,
-    halves,
-    scratch,
-    SHAPE: tl.constexpr,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-):
+    points, floats, halves, scratch,
+    SHAPE: tl.constexpr, ROWS: tl.constexpr, IN: tl.constexpr,
+):  # fmt: skip
     """F of a tile (ROWS,), and its gradient, a tuple of IN columns (ROWS,); by both sweeps.
 
     As in `siren.py`, without the 2π of each layer: s_d = w cos 2πτ_d, s_i = (s_{i+1} M_{i+1}ᵀ) cos 2πτ_i and
@@ -357,15 +328,9 @@ def jet_of_tile(
 
 @triton.jit
 def _down(
-    points,
-    s,
-    floats,
-    halves,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    PIECE: tl.constexpr,
-):
+    points, s, floats, halves,
+    ROWS: tl.constexpr, IN: tl.constexpr, WIDTH: tl.constexpr, PIECE: tl.constexpr,
+):  # fmt: skip
     """From s₂ in registers to s₁M₁ᵀ, IN columns, piece by piece of the first layer."""
     unit = tl.arange(0, WIDTH)
     high, low = halves_of(s)

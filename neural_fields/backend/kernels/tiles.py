@@ -1,17 +1,15 @@
 """Value and gradient of a network of any width for a tile of points, in IEEE float32.
 
-A tile is a matrix of ROWS points. Products are made COLUMNS units at a time, in an accumulator (ROWS, COLUMNS) that
-stays in registers, PIECE inner units after PIECE. Where it is as wide as the network (up to 128 units):
+A tile is a matrix of ROWS points. Products are made COLUMNS units at a time, in an accumulator (ROWS, COLUMNS) in
+registers, PIECE inner units after PIECE. Where it is as wide as the network (up to 128 units):
 
 - the first sine layer is never kept: each piece of it is made from the points when a product needs it;
 - the last one goes from its accumulator into the output's sum;
 - the first layer's cosines are made again from the points for the end of the sweep back.
 
-So a jet of (128, 2) puts one matrix aside, s₂. What is put aside lies in a scratch of the program's own: `planes` of
-ROWS times its width, small enough for caches. Layer i is in plane i mod 2 on both sweeps; that of layer i − 1 is free
-by then. The cosines of the layers between first and last follow. Products read a plane piece by piece, in a loop: a
-product over all inner units at once is unrolled, and spills thousands of bytes of registers. Units beyond the width
-have weights and biases of 0.
+Other matrices lie in a scratch of the program's own: `planes` of ROWS times its width. Layer i is in plane i mod 2 on
+both sweeps; the cosines of the layers between first and last follow. Products read a plane piece by piece, in a loop:
+an unrolled one would spill thousands of bytes of registers. Units beyond the width have weights and biases of 0.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -23,31 +21,18 @@ import triton
 import triton.language as tl
 from triton.language.extra import libdevice
 
-__all__ = [
-    "cosine",
-    "first_phase",
-    "jet_of_tile",
-    "planes",
-    "product_from",
-    "sine",
-]
-
 # The interpreter runs kernels with numpy and has no libdevice; its sine is numpy's.
 INTERPRETED = tl.constexpr(bool(triton.knobs.runtime.interpret))
 
 
 def planes(depth: int) -> int:
-    """How many matrices of ROWS points a program puts aside."""
+    """Number of matrices of ROWS points in a program's scratch."""
     return max(2, depth)
 
 
 @triton.jit
 def sine(z):
-    """Sin z, to two units in the last place whatever z is: phases grow with ω₀, so that a fast sine will not do.
-
-    By CUDA's libdevice (``__nv_sinf``). ``sin.approx``, which options may make of a sine, is 2⁻²¹ off within [−π, π]
-    already, and loses a digit with each digit of its argument.
-    """
+    """Sin z, to two units in the last place for any z, by CUDA's libdevice (``sin.approx`` loses digits with z)."""
     if INTERPRETED:
         return tl.sin(z)
     else:
@@ -65,7 +50,7 @@ def cosine(z):
 
 @triton.jit
 def first_phase(points, weight, bias, unit, omega, WIDTH: tl.constexpr, IN: tl.constexpr):
-    """ω₀(W₁x + b₁) for some units; so few inner columns are no product for ``tl.dot``, which wants 16."""
+    """ω₀(W₁x + b₁) for some units; too few inner columns for ``tl.dot``, which wants 16."""
     real = unit < WIDTH
     z = tl.load(bias + unit, mask=real, other=0.0)[None, :]
     for axis in tl.static_range(IN):
@@ -76,15 +61,9 @@ def first_phase(points, weight, bias, unit, omega, WIDTH: tl.constexpr, IN: tl.c
 
 @triton.jit
 def product_from(
-    plane,
-    z,
-    weight,
-    unit,
-    WIDTH: tl.constexpr,
-    STRIDE: tl.constexpr,
-    PIECE: tl.constexpr,
-    TRANSPOSED: tl.constexpr,
-):
+    plane, z, weight, unit,
+    WIDTH: tl.constexpr, STRIDE: tl.constexpr, PIECE: tl.constexpr, TRANSPOSED: tl.constexpr,
+):  # fmt: skip
     """Z + P Wᵀ (``TRANSPOSED``: on the way up) or z + P W (on the way back) for some units, P a plane."""
     row = tl.arange(0, z.shape[0])
     for first in range(0, WIDTH, PIECE):
@@ -101,15 +80,9 @@ def product_from(
 
 @triton.jit
 def _second_from_points(
-    points,
-    z,
-    parameters,
-    unit,
-    omega,
-    WIDTH: tl.constexpr,
-    IN: tl.constexpr,
-    PIECE: tl.constexpr,
-):
+    points, z, parameters, unit, omega,
+    WIDTH: tl.constexpr, IN: tl.constexpr, PIECE: tl.constexpr,
+):  # fmt: skip
     """Z + h₁W₂ᵀ for some units, each piece of h₁ made on the way."""
     for first in range(0, WIDTH, PIECE):
         inner = first + tl.arange(0, PIECE)
@@ -122,19 +95,10 @@ def _second_from_points(
 
 @triton.jit
 def _phase(
-    points,
-    parameters,
-    scratch,
-    unit,
-    omega,
-    LAYER: tl.constexpr,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    STRIDE: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    PIECE: tl.constexpr,
-):
+    points, parameters, scratch, unit, omega,
+    LAYER: tl.constexpr, ROWS: tl.constexpr, IN: tl.constexpr, WIDTH: tl.constexpr, STRIDE: tl.constexpr,
+    COLUMNS: tl.constexpr, PIECE: tl.constexpr,
+):  # fmt: skip
     """The phases ω₀(W h + b) of some units of a layer, counted from 0, whose layer below is kept or easily made."""
     if LAYER == 0:
         return first_phase(points, parameters[0], parameters[1], unit, omega, WIDTH, IN)
@@ -151,34 +115,15 @@ def _phase(
 
 @triton.jit
 def jet_of_tile(
-    points,
-    parameters,
-    scratch,
-    omega,
-    gain,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
+    points, parameters, scratch, omega, gain,
+    ROWS: tl.constexpr, IN: tl.constexpr, WIDTH: tl.constexpr, DEPTH: tl.constexpr, COLUMNS: tl.constexpr,
     PIECE: tl.constexpr,
-):
+):  # fmt: skip
     """F of a tile (ROWS,), and its gradient, a tuple of IN columns (ROWS,); both sweeps.
 
-    As in `siren.py`, with ω₀ beside the cosines: s_i = g_i ⊙ ω₀ cos ω₀z_i, g_{i−1} = s_i W_i.
-
-    Args:
-        points: the coordinates, a tuple of IN columns (ROWS,).
-        parameters: pointers (W₁, b₁, …, W_d, b_d, w_out, b_out) to what the module keeps, without ω₀.
-        scratch: pointer to what the program may write, `planes` times ROWS times its padded width.
-        omega: what phases are multiplied by, ω₀ times the unit of the sine layers' parameters.
-        gain: the unit of the output's parameters.
-        ROWS: points of a tile.
-        IN: coordinates of a point.
-        WIDTH: of the sine layers.
-        DEPTH: how many sine layers.
-        COLUMNS: units of an accumulator, a power of two ≥ 16.
-        PIECE: inner units of one ``tl.dot``, a power of two ≥ 16 and at most COLUMNS.
+    As in `siren.py`, with ω₀ beside the cosines: s_i = g_i ⊙ ω₀ cos ω₀z_i, g_{i−1} = s_i W_i. ``points`` is a tuple of
+    IN columns, ``parameters`` pointers (W₁, b₁, …, w_out, b_out) without ω₀, ``scratch`` has `planes` times ROWS times
+    the padded width; ``omega`` and ``gain`` are those of `Network`, the constants those of `Tiling`.
     """
     BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
     STRIDE: tl.constexpr = BLOCKS * COLUMNS

@@ -1,12 +1,11 @@
 """Rays that march through one network in one launch: each stays in registers until it meets the surface or leaves.
 
-`tracing._march` evaluates the field once a pass, and between passes has some seventy small operations; on a GPU each is
-a launch. Here a program marches ROWS rays at a time: a value of its tile, then the same rules (`rules.py`) in
-registers. A ray that ends writes what it found, and the next ray of a queue takes its place. All programs share the
-queue, so tiles stay full. What a ray finds does not depend on the program that marches it.
+`tracing._march` has some seventy small operations between evaluations; on a GPU each is a launch. Here a program
+marches ROWS rays at a time: a value of its tile, then the rules of `tracing._march.look` in registers. A ray that ends
+writes its results, and the next ray of a queue, shared by all programs, takes its place.
 
-The rules are those of `sphere_trace` for a field without bands and without expectations. Decisions are the same;
-values differ by rounding, so depths do by about as much over the slope.
+The rules are those of `sphere_trace` for a field without bands and without expectations. Decisions are the same; values
+differ by rounding, and depths by about as much over the slope.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -21,46 +20,29 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import launch
+from .launch import half_scratch, launch
 from .levels import Levels
-from .rules import look_at, turned_back
-from .siren import half_scratch
 from .tensor_tiles import keep, value_of_tile
-
-__all__ = ["IN_REGISTERS", "Marched", "Queue", "RayTensors", "march_rays"]
 
 # One network of so many units leaves registers enough to keep rays there too.
 IN_REGISTERS = 128
 
 
 class RayTensors(NamedTuple):
-    """Rays on a device.
+    """Rays on a device."""
 
-    Attributes:
-        origins: ``(N, 3)``, or ``(1, 3)`` for all of them.
-        directions: ``(N, 3)`` of unit length.
-        starts: ``(N,)`` depth at which each begins.
-        entries: ``(N,)`` depth to which it may go back if that is behind the surface.
-        ends: ``(N,)`` depth at which it gives up.
-    """
-
-    origins: Tensor
-    directions: Tensor
-    starts: Tensor
-    entries: Tensor
-    ends: Tensor
+    origins: Tensor  # (N, 3), or (1, 3) for all of them
+    directions: Tensor  # (N, 3) of unit length
+    starts: Tensor  # (N,) depth at which each begins
+    entries: Tensor  # (N,) depth to which it may go back if that is behind the surface
+    ends: Tensor  # (N,) depth at which it stops
 
 
 class Queue(NamedTuple):
-    """Rays that wait to be marched.
+    """Rays to be marched."""
 
-    Attributes:
-        rays: ``(N,)`` int32, numbers of rays.
-        state: ``(2,)`` int32: how many of them there are, and how many programs have taken; the second begins at 0.
-    """
-
-    rays: Tensor
-    state: Tensor
+    rays: Tensor  # (N,) int32, their numbers
+    state: Tensor  # (2,) int32, how many there are, and how many were taken
 
     @classmethod
     def of(cls, starts: Tensor, ends: Tensor) -> Queue:
@@ -76,63 +58,113 @@ class Queue(NamedTuple):
 
 
 class Marched(NamedTuple):
-    """What rays found, ``(N,)`` each; the names are those of `mplicits.neural_fields.Hits`.
+    """Results of rays, ``(N,)`` each; the names are those of `Hits`."""
 
-    Attributes:
-        mask: whether a ray meets the surface.
-        depth: where, or where its search ended.
-        steps: how often the network was evaluated on it.
-        slope: how fast the field fell along the ray at its last step.
-        level: how many bands its last value lay in.
-    """
-
-    mask: Tensor
-    depth: Tensor
-    steps: Tensor
-    slope: Tensor
-    level: Tensor
+    mask: Tensor  # whether a ray meets the surface
+    depth: Tensor  # where, or where its search ended
+    steps: Tensor  # evaluations of the network on it
+    slope: Tensor  # how fast the field fell along the ray at its last step
+    level: Tensor  # how many bands its last value lay in
 
     @classmethod
     def nothing(cls, starts: Tensor) -> Marched:
-        """Memory for what kernels find, in the types that they write, filled in for rays that never begin."""
+        """Memory for results, in the types of kernels, filled in for rays that never begin."""
         small, number = (torch.zeros_like(starts, dtype=dtype) for dtype in (torch.int8, torch.int32))
         return cls(small, starts.clone(), number, torch.ones_like(starts), torch.zeros_like(number))
 
     def in_own_types(self) -> Marched:
-        """In those of `mplicits.neural_fields.Hits`."""
+        """The results in the types of `Hits`."""
         return self._replace(mask=self.mask.bool(), steps=self.steps.long(), level=self.level.long())
+
+
+@triton.jit
+def first_band(value, deltas, LEVELS: tl.constexpr):
+    """How many bands values lie in, and the half-width of the first that they do not, 0 inside all of them."""
+    level, delta = tl.zeros(value.shape, tl.int32), tl.zeros(value.shape, tl.float32)
+    within = value == value
+    for index in tl.static_range(LEVELS - 1):
+        width = tl.load(deltas + index)
+        closer = within & (tl.abs(value) < width)
+        delta = tl.where(within & (closer == 0), width, delta)
+        level += closer.to(tl.int32)
+        within = closer
+    return level, delta
+
+
+@triton.jit
+def turned_back(raw, depth, entry, low, low_value, sign):
+    """Which rays start behind the surface and go back to where they may begin, and the new sign of values."""
+    fresh = (low_value == float("inf")) & (depth == low)
+    back = fresh & (raw < 0) & (depth > entry)
+    return back, tl.where(fresh & (raw < 0), tl.where(back, 1.0, -1.0), sign)
+
+
+@triton.jit
+def look_at(
+    value, delta, depth, far, low, low_value, free, gap, high, high_value, boldness, steps, tolerance, resolution,
+    lipschitz,
+    PATIENCE: tl.constexpr, BOLDNESS: tl.constexpr, STEEPEST_RISE: tl.constexpr, BAND_ENTRY: tl.constexpr,
+    FLOOR: tl.constexpr,
+):  # fmt: skip
+    """Take in values at ``depth``, the ``steps``-th of each ray, outside a band of half-width ``delta``, or 0.
+
+    Returns the columns depth, low, low_value, free, gap, high, high_value and boldness of ``Rays``; then hit, passed,
+    the depth of a hit, and the slope.
+    """
+    infinite = float("inf")
+    wide = tl.maximum(BAND_ENTRY * delta, resolution * tl.exp2(((steps - 1) // PATIENCE).to(tl.float32)))
+    new_free = tl.maximum((tl.abs(value) - delta) / lipschitz, 0.0)
+    known = low_value < infinite
+    slope = tl.where(known, (value - low_value) / tl.where(known & (depth != low), depth - low, 1.0), -1.0)
+    enclosed = high < infinite
+    sound = enclosed | (depth - low - free - new_free <= gap)
+    before, behind = sound & (value > 0), sound & (value <= 0)
+    new_low, new_high = tl.where(before, depth, low), tl.where(behind, depth, high)
+    new_low_value, new_high_value = tl.where(before, value, low_value), tl.where(behind, value, high_value)
+
+    s = tl.minimum(tl.maximum(slope, -1.0), STEEPEST_RISE)
+    widest = boldness * new_free * (1 + s) / (1 - s)
+    zero_at = tl.where(s < 0, value / tl.where(s < 0, -s, 1.0), infinite)
+    ahead = depth + new_free + tl.maximum(widest, tl.minimum(wide, zero_at - new_free))
+    ahead = tl.where(before, ahead, low + free)
+    closed = new_high < infinite
+    width = tl.where(closed, new_high - new_low, 0.0)
+    span = tl.where(closed & (new_low_value < infinite), new_low_value - new_high_value, 1.0)
+    span = tl.where(span == 0, 1.0, span)  # of rays that have ended, on places that nobody takes
+    chord = new_low + width * tl.where(new_low_value < infinite, new_low_value / span, 1.0)
+    halved = (enclosed == 0) | (2 * width <= high - low)
+    closing = tl.where(halved, chord, new_low + width / 2)
+
+    steep = tl.minimum(tl.abs(slope), 1.0)
+    near = sound & (delta == 0) & (tl.abs(value) <= tl.maximum(tolerance * steep, FLOOR))
+    pinned = closed & (width <= tolerance)
+    passed = before & (closed == 0) & (depth + new_free + wide >= far) & (near == 0)
+    step = value / tl.maximum(steep, 1e-30)  # nothing steeper matters: it is cut off at the tolerance
+    landing = depth + tl.minimum(tl.maximum(step, -tolerance), tolerance)
+    return (
+        tl.minimum(tl.where(closed, closing, ahead), far),
+        new_low,
+        new_low_value,
+        tl.where(before, new_free, free),
+        wide,
+        new_high,
+        new_high_value,
+        tl.where(sound | (known == 0), boldness, boldness / 2),
+        near | pinned,
+        passed,
+        tl.where(near, landing, tl.where(pinned, chord, depth)),
+        steep,
+    )
 
 
 @triton.jit(do_not_specialize=["max_steps"])
 def march(
-    origins,
-    directions,
-    starts,
-    entries,
-    ends,
-    listed,
-    queue,
-    floats,
-    halves,
-    found_mask,
-    found_depth,
-    found_steps,
-    found_slope,
-    scratch,
-    exchanged,
-    numbers,
-    max_steps,
-    PATIENCE: tl.constexpr,
-    BOLDNESS: tl.constexpr,
-    STEEPEST_RISE: tl.constexpr,
-    BAND_ENTRY: tl.constexpr,
-    FLOOR: tl.constexpr,
-    ORIGIN: tl.constexpr,
-    SHAPE: tl.constexpr,
-    SCRATCH: tl.constexpr,
-    ROWS: tl.constexpr,
+    origins, directions, starts, entries, ends, listed, queue, floats, halves, found_mask, found_depth, found_steps,
+    found_slope, scratch, exchanged, numbers, max_steps,
+    PATIENCE: tl.constexpr, BOLDNESS: tl.constexpr, STEEPEST_RISE: tl.constexpr, BAND_ENTRY: tl.constexpr,
+    FLOOR: tl.constexpr, ORIGIN: tl.constexpr, SHAPE: tl.constexpr, SCRATCH: tl.constexpr, ROWS: tl.constexpr,
     REFILL: tl.constexpr,
-):
+):  # fmt: skip
     """March all rays of a queue; ``numbers`` are the tolerance, the resolution and the Lipschitz constant."""
     infinite = float("inf")
     own = scratch + tl.cast(tl.program_id(0), tl.int64) * SCRATCH
@@ -217,17 +249,10 @@ def march_rays(
     max_steps: int,
     constants: dict[str, float],
 ) -> None:
-    """March the rays of a queue to the surface of one network, up to 128 units wide.
+    """March the rays of a queue to the surface of one three-dimensional network up to 128 units wide.
 
-    Args:
-        levels: one, on the rays' device, in three dimensions.
-        rays: contiguous.
-        queue: its state is changed.
-        found: written, for the rays of the queue.
-        numbers: ``(3,)`` on the device: tolerance, resolution and Lipschitz constant of `sphere_trace`.
-        max_steps: see there.
-        constants: PATIENCE, BOLDNESS, STEEPEST_RISE and BAND_ENTRY of `_march`, and FLOOR, the size below which a value
-            is zero.
+    ``numbers`` ``(3,)`` are tolerance, resolution and Lipschitz constant of `sphere_trace`, on the device;
+    ``constants`` are those of `march_constants`. Results go to ``found``; the state of the queue changes.
     """
     (network,) = levels.networks
     rows = network.shape.rows

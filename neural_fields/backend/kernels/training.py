@@ -1,4 +1,6 @@
-"""The backward pass of a jet in one launch: cotangents of points, weights and biases from those of value and gradient.
+"""The jet of a SIREN in IEEE float32 for training, and its backward pass, in one launch each.
+
+The backward pass maps cotangents of value and gradient to those of points, weights and biases.
 
 Let f̄ and ḡ be the cotangents of f and ∇f, with φ_i = ω₀(W_i h_{i−1} + b_i), c_i = ω₀ cos φ_i and s_i = g_i ⊙ c_i as in
 `tiles.py`. The sweep back is linear in ḡ, and its adjoint is one tangent forward:
@@ -11,8 +13,7 @@ The adjoint of the value adds what the tangent meets of the cosines' derivative:
     W̄_i = Σ s_iᵀ u_{i−1} + z̄_iᵀ h_{i−1},   b̄_i = Σ z̄_i,   w̄ = Σ u_d + f̄ h_d.
 
 Only the points are kept from the forward pass. Sweeps up and back are made again, tile by tile, into five planes for
-each layer (h, c, g, s, u; z̄ takes the place of g). A GPU's second-level cache can hold them. Sums over points
-are made by each program for itself and added up at the end, in the same order every time.
+each layer (h, c, g, s, u; z̄ takes the place of g). Each program sums over its points, and the sums are added in order.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -26,31 +27,65 @@ from torch import Tensor
 
 from .launch import Network, Tiling, on_device, program_count, scratch_for, tiling_of
 from .tensor_tiles import points_of, rows_of
-from .tiles import add_first, cosine, first_phase, product_from, sine
+from .tiles import add_first, cosine, first_phase, jet_of_tile, planes, product_from, sine
 
-__all__ = ["jet_backward"]
+
+@triton.jit(do_not_specialize=["count"])
+def evaluate(
+    x, parameters, value, gradient, scratch, count, omega, gain,
+    PLANES: tl.constexpr, ROWS: tl.constexpr, IN: tl.constexpr, WIDTH: tl.constexpr, DEPTH: tl.constexpr,
+    COLUMNS: tl.constexpr, PIECE: tl.constexpr,
+):  # fmt: skip
+    """Every program takes tiles from its own number on, in steps of the number of programs."""
+    STRIDE: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS * COLUMNS
+    own = scratch + tl.program_id(0).to(tl.int64) * (PLANES * ROWS * STRIDE)
+    for tile in range(tl.program_id(0), tl.cdiv(count, ROWS), tl.num_programs(0)):
+        row = rows_of(tile, ROWS)
+        real = row < count
+        points = points_of(x, row, real, IN)
+        f, slope = jet_of_tile(points, parameters, own, omega, gain, ROWS, IN, WIDTH, DEPTH, COLUMNS, PIECE)
+        for axis in tl.static_range(IN):
+            tl.store(gradient + row * IN + axis, slope[axis], mask=real)
+        tl.store(value + row, f, mask=real)
+
+
+def jet(x: Tensor, network: Network) -> tuple[Tensor, Tensor]:
+    """F and its gradient at float32 points ``(N, d)`` → ``(N,)``, ``(N, d)``; N may be 0."""
+    value, gradient = x.new_empty(len(x)), x.new_empty(x.shape)
+    if len(x):
+        tiling = tiling_of(network.width)
+        programs = program_count(x.device, triton.cdiv(len(x), tiling.rows))
+        kept = planes(network.depth)
+        with on_device(x):
+            evaluate[(programs,)](  # pyright: ignore[reportIndexIssue]
+                x.contiguous(),
+                network.parameters,
+                value,
+                gradient,
+                scratch_for(x, programs, kept * tiling.rows * tiling.stride(network.width)),
+                len(x),
+                network.omega,
+                network.gain,
+                PLANES=kept,
+                ROWS=tiling.rows,
+                IN=x.shape[1],
+                WIDTH=network.width,
+                DEPTH=network.depth,
+                COLUMNS=tiling.columns,
+                PIECE=tiling.piece,
+                num_warps=tiling.warps,
+                num_stages=2,
+            )
+    return value, gradient
 
 
 @triton.jit(do_not_specialize=["count"])
 def sweep(
-    x,
-    parameters,
-    value_bar,
-    gradient_bar,
-    x_bar,
-    sums,
-    scratch,
-    count,
-    omega,
-    gain,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
+    x, parameters, value_bar, gradient_bar, x_bar, sums, scratch, count, omega, gain,
+    ROWS: tl.constexpr, IN: tl.constexpr, WIDTH: tl.constexpr, DEPTH: tl.constexpr, COLUMNS: tl.constexpr,
     PIECE: tl.constexpr,
-):
-    """Every program takes tiles in turn, and adds what they say of the weights to sums of its own."""
+):  # fmt: skip
+    """Every program takes tiles in turn, and adds their share of the weights' cotangents to sums of its own."""
     BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
     STRIDE: tl.constexpr = BLOCKS * COLUMNS
     PLANE: tl.constexpr = ROWS * STRIDE
@@ -147,19 +182,10 @@ def sweep(
 
 @triton.jit
 def _add_ends(
-    own,
-    kept,
-    points,
-    cotangents,
-    f_bar,
-    gain,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
-):
-    """Add what a tile says of the first layer and of the output."""
+    own, kept, points, cotangents, f_bar, gain,
+    ROWS: tl.constexpr, IN: tl.constexpr, WIDTH: tl.constexpr, DEPTH: tl.constexpr, COLUMNS: tl.constexpr,
+):  # fmt: skip
+    """Add a tile's share to the first layer and to the output."""
     BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
     STRIDE: tl.constexpr = BLOCKS * COLUMNS
     PLANE: tl.constexpr = ROWS * STRIDE
@@ -183,15 +209,10 @@ def _add_ends(
 
 @triton.jit
 def _add_products(
-    target,
-    layer,
-    ROWS: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    PIECE: tl.constexpr,
-):
-    """Add what a tile says of a square layer: sᵀ u + z̄ᵀ h, with u and h of the layer below, and the sum of z̄."""
+    target, layer,
+    ROWS: tl.constexpr, WIDTH: tl.constexpr, DEPTH: tl.constexpr, COLUMNS: tl.constexpr, PIECE: tl.constexpr,
+):  # fmt: skip
+    """Add a tile's share to a square layer: sᵀ u + z̄ᵀ h, with u and h of the layer below, and the sum of z̄."""
     BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
     STRIDE: tl.constexpr = BLOCKS * COLUMNS
     PLANE: tl.constexpr = ROWS * STRIDE
@@ -225,13 +246,9 @@ def _add(target, found, inside):
 
 
 def jet_backward(x: Tensor, network: Network, value_bar: Tensor, gradient_bar: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Cotangents of the points ``(N, d)`` and of the network's parameters, in their order and shapes.
+    """Cotangents of the points ``(N, d)`` and of the parameters of a network of one output, in their order and shapes.
 
-    Args:
-        x: points ``(N, d)``; see `mplicits.neural_fields.backend.kernels.ieee.jet`.
-        network: with one output.
-        value_bar: cotangent of f, ``(N,)``.
-        gradient_bar: cotangent of ∇f, ``(N, d)``.
+    ``value_bar`` ``(N,)`` and ``gradient_bar`` ``(N, d)`` are the cotangents of f and ∇f.
     """
     x_bar = x.new_empty(x.shape)
     sizes = [parameter.numel() for parameter in network.parameters]

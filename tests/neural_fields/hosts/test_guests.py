@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -106,20 +105,6 @@ def test_copies_are_the_same_to_the_bit_and_their_own(copied: Callable[[Field], 
             for parameter in other.parameters():
                 parameter.zero_()
         assert torch.equal(field.value(x), before)
-
-
-def test_threads_get_what_one_gets() -> None:
-    field, x = levels(), points(2000)
-    wanted, found = field.jet(x), list[Any]()
-    threads = [threading.Thread(target=lambda: found.extend(field.jet(x) for _ in range(5))) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(found) == 20
-    for jet in found:
-        assert torch.equal(jet.value, wanted.value)
-        assert torch.equal(jet.gradient, wanted.gradient)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])

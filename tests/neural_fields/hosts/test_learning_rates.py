@@ -110,15 +110,6 @@ def test_levels_of_all_parts_have_their_pace() -> None:
     assert rates == pytest.approx([*coarse, *fine, *alone, *coarse, *fine], rel=1e-12)
 
 
-def test_groups_in_units_are_in_the_same_proportion() -> None:
-    field = tapered()
-    plain = parameter_groups(field, 1e-3)
-    rescale_parameters(field, 5e-4)
-    units = [unit for siren in field.levels for unit in siren.units]  # pyright: ignore[reportAttributeAccessIssue]
-    for one, other, unit in zip(plain, parameter_groups(field, 1e-3), units, strict=True):
-        assert other["lr"] * unit == pytest.approx(one["lr"], rel=1e-12)
-
-
 def test_every_parameter_is_in_one_group() -> None:
     field = Union(tapered(), Sphere(), Siren(8, 1))
     field.register_parameter("weight", nn.Parameter(torch.zeros(1)))
@@ -128,21 +119,6 @@ def test_every_parameter_is_in_one_group() -> None:
     assert groups[-1]["lr"] == 1e-3
     torch.optim.Adam(groups)
     assert parameter_groups(Sphere()) == []
-
-
-@pytest.mark.parametrize("unit", [0.3, 0.0, -1.0, float("inf")])
-def test_units_are_powers_of_two(unit: float) -> None:
-    with pytest.raises(ValueError, match="power of two"):
-        Siren(8, 1).set_units(output=unit)
-
-
-def test_rates_are_positive() -> None:
-    for function in (parameter_groups, rescale_parameters):
-        with pytest.raises(ValueError, match="lr=0"):
-            function(Siren(8, 1), 0)
-        for pace, message in ((-1.0, "pace=-1"), ((1.0, 0.0), "pace=0"), ((), "pace: there is none")):
-            with pytest.raises(ValueError, match=message):
-                function(Siren(8, 1), pace=pace)
 
 
 def test_lifted_into_space_time_and_sliced_it_stays_the_same() -> None:

@@ -137,17 +137,6 @@ def test_normals_turn_with_the_mesh(tmp_path):
     np.testing.assert_array_equal(read_cloud(tmp_path / "mesh.ply").normals, turned)
 
 
-def test_what_is_taken_for_granted_is_said():
-    assert Placement().describe(".glb") == (
-        "y up, in m; one input unit is taken for 1 m (--unit says what it is); "
-        "y is taken to be up (--up says otherwise)"
-    )
-    assert Placement("z", "mm", center=True).describe(".glb") == (
-        "y up, in m (1 input unit = 0.001 m), centred at the origin"
-    )
-    assert Placement(unit="m").describe(".STL") == "in mm (1 input unit = 1000 mm)"
-
-
 def test_the_command_line_knows_the_same_formats_and_units():
     assert MESH_FILES == (".ply", ".obj", ".stl", ".glb")
     assert set(MESH_FILES) == set(FRAMES)

@@ -74,10 +74,3 @@ def test_it_is_kept_in_files_and_state_dicts(tmp_path: Path) -> None:
     other = EncodedField(small_multiscale(0.4), HashEncoding(levels=2, table_size=512, coarsest=4, finest=16))
     with pytest.raises(RuntimeError, match=r"gain is 2\.0 where the tensors come from and 64\.0 here"):
         other.load_state_dict(field.state_dict())
-
-
-def test_what_cannot_be_encoded_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"field\.in_dim=4: expected 3"):
-        EncodedField(Siren(8, 1, in_dim=4))
-    with pytest.raises(ValueError, match="gain=0"):
-        EncodedField(Siren(8, 1), gain=0)

@@ -1,10 +1,7 @@
 """The hash encoding: the published grid and hash, functions that it must reproduce, and both its derivatives."""
 
-import pytest
 import torch
 from mplicits.neural_fields.networks.hash_encoding import HashEncoding, grid_resolutions, spatial_hash, tables_apart
-
-from benchmarks.peers import HashGridSDF
 
 
 def small(**options: int) -> HashEncoding:
@@ -30,25 +27,6 @@ def test_hash_is_the_published_one() -> None:
     x, y, z = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1234, 777, 2048]]).unbind(dim=1)
     last = (1234 ^ (777 * 0x9E3779B1 % 2**32) ^ (2048 * 0x30025795 % 2**32)) % 2**19
     assert spatial_hash(x, y, z, 1 << 19).tolist() == [1, 0x779B1, 0x25795, 0x779B1 ^ 0x25795 ^ 1, last]
-
-
-def test_features_are_those_of_the_hash_grid() -> None:
-    """Of `HashGridSDF`, whose network here sums the features of all levels: relu(t) − relu(−t)."""
-    encoding = small(features=1)
-    field = HashGridSDF(levels=3, table_size=512, features=1, coarsest=4, finest=16, width=2, depth=1, extent=1.0)
-    field = field.double()
-    with torch.no_grad():
-        for table, entries in zip(
-            field.tables, encoding.table.split([len(table) for table in field.tables]), strict=True
-        ):
-            table.copy_(entries)
-        hidden, last = field.linear()
-        hidden.weight.copy_(torch.tensor([[1.0] * 3, [-1.0] * 3]))
-        last.weight.copy_(torch.tensor([[1.0, -1.0]]))
-        hidden.bias.zero_()
-        last.bias.zero_()
-    x = in_cube(300)
-    torch.testing.assert_close(encoding(x).sum(dim=-1), field.value(x))
 
 
 def test_linear_functions_are_reproduced() -> None:
@@ -98,21 +76,6 @@ def test_under_autocast_features_are_those_of_full_precision() -> None:
     assert torch.equal(found, expected)
     assert of_half.dtype == torch.float32
     assert torch.equal(torch.autograd.grad(found.square().sum(), encoding.table)[0], slope)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"table_size": 100}, "expected a power of two"),
-        ({"coarsest": 32}, "expected 1 ≤ coarsest ≤ finest"),
-        ({"levels": 0}, "expected at least 1"),
-        ({"features": 0}, "expected at least 1"),
-        ({"extent": 0}, "expected"),
-    ],
-)
-def test_sizes_out_of_range_are_refused(options: dict[str, int], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        HashEncoding(**{"finest": 16} | options)
 
 
 def test_tables_are_told_from_all_other_parameters() -> None:

@@ -8,7 +8,6 @@ from bounds import assert_within, rounding
 from fields import Watched, small_multiscale
 from mplicits.neural_fields import Field, Jet, Moving, MultiscaleSDF, RigidMotion, Siren, Sphere, TimeSlice
 from mplicits.neural_fields.fields.field import OneLevelField
-from mplicits.neural_fields.networks.multiscale import levels_of
 from torch import Tensor
 
 
@@ -41,12 +40,6 @@ def test_sum_of_the_paper_is_the_field() -> None:
         inside = inside & (f.abs() < delta)
         f = torch.where(inside, f + residual.value(x), f)
     assert_within(sdf.value(x), f, 2 * rounding(sdf, x, lambda field, x: [field.value(x)])[0])
-
-
-def test_levels_of_a_field() -> None:
-    sdf, sphere = small_multiscale(), Sphere()
-    assert levels_of(sdf) == sdf.levels == (sdf.base, *sdf.residuals)
-    assert levels_of(sphere) == (sphere,)
 
 
 METHODS: dict[str, Callable[[Field, Tensor, int], object]] = {
@@ -122,22 +115,3 @@ def test_training_reaches_every_level() -> None:
     sdf = small_multiscale(0.3)
     sdf.jet(2 * torch.rand(500, 3) - 1).gradient.square().sum().backward()
     assert all(p.grad is not None and bool((p.grad != 0).any()) for n, p in sdf.named_parameters() if "weight" in n)
-
-
-@pytest.mark.parametrize(
-    ("residuals", "deltas", "options", "message"),
-    [
-        ([], [0.1], {}, "deltas has 1 entries for 0 residuals"),
-        ([Siren(4, 1)], [0.0], {}, "expected numbers > 0"),
-        ([Siren(4, 1)], [0.1], {"taper": 1.5}, "taper=1.5"),
-        ([Siren(4, 1, in_dim=4)], [0.1], {}, r"residuals\[0\].in_dim=4"),
-    ],
-)
-def test_bad_arguments(residuals: list[Field], deltas: list[float], options: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        MultiscaleSDF(Sphere(), residuals, deltas, **options)
-
-
-def test_from_widths_needs_one_omega_per_level() -> None:
-    with pytest.raises(ValueError, match="omegas has 1 entries for 2 sizes"):
-        MultiscaleSDF.from_widths([(8, 1), (8, 1)], omegas=[30])

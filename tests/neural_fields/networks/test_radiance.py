@@ -1,8 +1,7 @@
 """Colour by direction, and the encodings."""
 
-import pytest
 import torch
-from mplicits.neural_fields import Jet, Sphere, ViewColor
+from mplicits.neural_fields import Sphere, ViewColor
 from mplicits.neural_fields.networks.hash_encoding import HashEncoding
 from mplicits.neural_fields.networks.radiance import Outside, encode, encoded_size
 
@@ -41,20 +40,6 @@ def test_a_grid_is_trained_where_it_is_looked_up_and_moves_with_the_colours(devi
     color(x, x, Sphere().to(device).jet(x)).sum().backward()
     assert color.grid.table.grad is not None
     assert int((color.grid.table.grad != 0).any(dim=1).sum()) == 2 * 8  # the corners of a cell of each level
-
-
-def test_features_of_another_number_are_refused() -> None:
-    jet = Jet(torch.zeros(2), torch.ones(2, 3), torch.zeros(2, 5))
-    with pytest.raises(ValueError, match="5 of them; expected 4"):
-        ViewColor(4)(torch.zeros(2, 3), torch.zeros(2, 3), jet)
-
-
-@pytest.mark.parametrize(
-    "setting", [{"num_features": -1}, {"num_features": 1, "width": 0}, {"num_features": 1, "depth": 0}]
-)
-def test_sizes_out_of_range_are_refused(setting: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match="expected at least"):
-        ViewColor(**setting)
 
 
 def test_outside_gives_density_and_colour() -> None:

@@ -108,15 +108,6 @@ def test_non_contiguous_points() -> None:
             assert_within(a, b, 2 * bound)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [({"width": 0, "depth": 2}, "width=0"), ({"width": 8, "depth": 0}, "depth=0"), ({"omega": -1.0}, "omega=-1")],
-)
-def test_bad_arguments(arguments: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Siren(**{"width": 8, "depth": 2, **arguments})  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(("training", "times"), [(False, 2.5), (True, 3.0)])
 def test_a_second_jet_costs_two_and_a_half_jets(training: bool, times: float) -> None:
     """Products of width × width matrices: a sweep forward and one back in a jet, three tangents more in a second jet.

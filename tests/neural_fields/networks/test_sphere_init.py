@@ -1,10 +1,8 @@
 """SIRENs that begin as spheres."""
 
-import copy
-
 import pytest
 import torch
-from mplicits.neural_fields import NeuSGeometry, Siren
+from mplicits.neural_fields import Siren
 from mplicits.neural_fields.networks.sphere_init import fit_sphere, solve_sphere
 
 
@@ -31,40 +29,6 @@ def test_a_siren_becomes_the_distance_of_a_sphere(radius: float) -> None:
     cosine = torch.nn.functional.cosine_similarity(jet.gradient[away], x[away], dim=1)
     assert float(cosine.mean()) > 0.98
     assert abs(float(jet.gradient[away].norm(dim=1).mean()) - 1) < 0.1
-
-
-def test_the_sphere_reaches_the_rim_of_the_unit_ball() -> None:
-    network = Siren(32, 2, omega=10.0)
-    fit_sphere(network, 0.5)
-    rim = torch.nn.functional.normalize(torch.randn(2000, 3), dim=1)
-    with torch.no_grad():
-        assert float((network.value(rim) - 0.5).abs().max()) < 0.2
-        assert float(network.value(rim).min()) > 0.3
-
-
-def test_the_same_random_state_gives_the_same_start() -> None:
-    weights = []
-    for seed in (0, 0, 1):
-        torch.manual_seed(seed)
-        network = Siren(16, 1, omega=10.0)
-        fit_sphere(network, steps=5, batch=64)
-        weights.append(network.output.weight.detach().clone())
-    assert torch.equal(weights[0], weights[1])
-    assert not torch.equal(weights[0], weights[2])
-
-
-def test_features_are_left_as_they_were() -> None:
-    """Only distances are trained; the features' own weights see no gradient."""
-    network = Siren(16, 2, omega=10.0, num_features=4)
-    fit_sphere(network, steps=5, batch=64)
-    assert network.jet(torch.zeros(3, 3)).features.shape == (3, 4)
-    assert all(bool(parameter.isfinite().all()) for parameter in network.parameters())
-
-
-@pytest.mark.parametrize("radius", [0.0, -1.0])
-def test_a_sphere_without_a_radius_is_refused(radius: float) -> None:
-    with pytest.raises(ValueError, match=f"radius={radius}: expected > 0"):
-        fit_sphere(Siren(16, 1, omega=10.0), radius)
 
 
 def solved(radius: float = 0.35) -> Siren:
@@ -127,29 +91,6 @@ def test_a_solved_start_draws_nothing_and_leaves_features_and_units() -> None:
         solve_sphere(network, 0)
 
 
-def first_step(network: Siren, radius: float) -> float:
-    """How far a sphere moves, in radii, if Adam's first step at NeuS's full rate takes all weights to the same side."""
-    geometry = NeuSGeometry(network, learning_rate=5e-4)
-    x = torch.nn.functional.normalize(torch.randn(1000, 3), dim=1) * radius
-    adam = torch.optim.Adam(geometry.parameters(), lr=5e-4)
-    before = geometry.sdf(x).mean()
-    before.backward()
-    adam.step()
-    with torch.no_grad():
-        return float(before - geometry.sdf(x).mean()) / radius
-
-
-@pytest.mark.slow
-def test_a_trained_start_outlasts_a_first_step_without_warm_up() -> None:
-    """A surface that moves by its radius is gone: instant-nsr-pl has no warm-up, and NeuS's may be cut short."""
-    torch.manual_seed(0)
-    trained, linear = (Siren(128, 4, omega=10.0) for _ in range(2))
-    fit_sphere(trained, 0.35)
-    solve_sphere(linear, 0.35)
-    assert first_step(trained, 0.35) < 1
-    assert first_step(linear, 0.35) > 1  # what the description of `solve_sphere` warns of
-
-
 def test_a_trained_start_does_not_depend_on_units() -> None:
     """Powers of two round nothing, so that the same numbers come to the bit."""
     found = []
@@ -161,37 +102,3 @@ def test_a_trained_start_does_not_depend_on_units() -> None:
         assert network.units == units
         found.append(network.state_dict())
     assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
-
-
-def slopes_per_value(depth: int) -> float:
-    """By how much Adam's first step changes slopes, over how much it changes values, where values err at random."""
-    torch.manual_seed(0)
-    network = Siren(64, depth, omega=10.0)
-    fit_sphere(network, 0.35, steps=60, batch=256)
-    geometry = NeuSGeometry(network, learning_rate=5e-4)
-    x = torch.nn.functional.normalize(torch.randn(500, 3), dim=1) * torch.rand(500, 1) ** (1 / 3)
-    start = copy.deepcopy(geometry.state_dict())
-    squares = torch.zeros(2)
-    for draw in range(4):
-        geometry.load_state_dict(start)
-        adam = torch.optim.Adam(geometry.parameters(), lr=5e-4)
-        adam.zero_grad()
-        before = network.jet(x)
-        (before.value * torch.randn(500, generator=torch.Generator().manual_seed(draw))).sum().backward()
-        adam.step()
-        after = network.jet(x)
-        squares[0] += (after.value - before.value).detach().square().sum()
-        squares[1] += (after.gradient - before.gradient).detach().square().sum()
-    value, slope = squares.sqrt().tolist()
-    return slope / value
-
-
-def test_each_sine_layer_makes_steps_wave_more() -> None:
-    """Sines of sines: a layer's frequencies are those of the layer before, times its own phases.
-
-    What a step changes has that frequency. Hence two layers in level 0 where only values are asked for. Between seeds
-    a quotient differs by an eighth.
-    """
-    found = [slopes_per_value(depth) for depth in (1, 2, 4)]
-    assert found[0] * 1.125 < found[1]
-    assert found[1] * 1.5 < found[2]

@@ -1,25 +1,18 @@
 """Colour networks and texture fields: values, Jacobians, directional derivatives, and the band."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from bounds import assert_within, rounding
-from fields import Watched, small_multiscale
+from fields import Watched
 from mplicits.neural_fields import (
     Field,
-    InputError,
     Jet,
     MultiscaleSDF,
     Siren,
     Sphere,
     TextureField,
     Torus,
-    load_field,
-    load_texture,
-    save_field,
 )
-from mplicits.neural_fields.checkpoint import save_texture
 from mplicits.neural_fields.fields.losses import color_loss, tangential_loss
 from mplicits.neural_fields.networks.texture import ColorSiren
 from torch import Tensor
@@ -95,13 +88,6 @@ def test_parameter_gradients_of_the_derivatives_agree_with_autograd(depth: int) 
     for a, b, c in zip(expected, found_by_jet, found_by_tangent, strict=True):
         torch.testing.assert_close(b, a)
         torch.testing.assert_close(c, a)
-
-
-def test_derivative_along_passes_gradcheck_twice() -> None:
-    made = ColorSiren(4, 2, omega=3.0).double()
-    x, v = cube(3).requires_grad_(), cube(3).requires_grad_()
-    assert torch.autograd.gradcheck(made.derivative_along, (x, v))
-    assert torch.autograd.gradgradcheck(made.derivative_along, (x, v))
 
 
 def test_inference_in_blocks_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,74 +185,3 @@ def test_loss_terms_are_those_of_the_paper() -> None:
     torch.testing.assert_close(color_loss(color, target), torch.tensor([0.0, (0.36 + 0.09) / 3]))
     derivative = torch.tensor([[3.0, 0.0, -4.0], [0.0, 0.0, 0.0]])
     torch.testing.assert_close(tangential_loss(derivative, 0.1), torch.tensor([0.01 * 25 / 3, 0.0]))
-
-
-def test_bad_arguments() -> None:
-    sphere = Sphere()
-    with pytest.raises(ValueError, match=r"delta=0.0: expected > 0"):
-        TextureField(sphere, network(), delta=0.0)
-    with pytest.raises(ValueError, match="network: of 4 dimensions; the geometry has 3"):
-        TextureField(sphere, network(in_dim=4), delta=0.1)
-    with pytest.raises(ValueError, match="outside"):
-        TextureField(sphere, network(), delta=0.1, outside=(0, 0, 2))
-    with pytest.raises(ValueError, match="level=3"):
-        TextureField(sphere, network(), delta=0.1, geometry_level=3)
-    field = texture()
-    for method in (field.value, field.jet, field.in_band, field.colors):
-        with pytest.raises(ValueError, match=r"expected \(\.\.\., 3\)"):
-            method(torch.zeros(5, 4))
-    with pytest.raises(ValueError, match="direction has shape"):
-        field.derivative_along(torch.zeros(5, 3), torch.zeros(4, 3))
-    with pytest.raises(ValueError, match="this field has levels"):
-        field.value(torch.zeros(5, 3), level=1)
-
-
-def saved_texture(directory: Path) -> tuple[TextureField, Path]:
-    field = TextureField(small_multiscale(), network(3), delta=0.15, geometry_level=1, outside=(0.1, 0.2, 0.3))
-    save_texture(directory / "t.safetensors", field, metadata={"seed": 3})
-    return field, directory / "t.safetensors"
-
-
-def test_textures_survive_the_disk(tmp_path: Path, dtype: torch.dtype) -> None:
-    field, path = saved_texture(tmp_path)
-    field.to(dtype)
-    save_texture(path, field)
-    save_field(tmp_path / "f.safetensors", field.geometry)
-    geometry = load_field(tmp_path / "f.safetensors").field
-    loaded = load_texture(path, geometry)
-    x = cube(500, dtype=dtype)
-    assert loaded.geometry is geometry
-    assert loaded.geometry_level == 1
-    assert torch.equal(loaded.value(x), field.value(x))
-    assert torch.equal(loaded.jet(x).gradient, field.jet(x).gradient)
-    assert not any(parameter.requires_grad for parameter in loaded.network.parameters())
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["f.safetensors", "t.safetensors"]
-
-
-def test_a_texture_is_refused_by_another_geometry_but_not_by_another_precision(tmp_path: Path) -> None:
-    field, path = saved_texture(tmp_path)
-    with pytest.raises(InputError, match="the texture of another field"):
-        load_texture(path, small_multiscale())
-    geometry = field.geometry.double()
-    assert load_texture(path, geometry).geometry is geometry
-    assert next(geometry.parameters()).dtype == torch.float64
-    assert all(parameter.requires_grad for parameter in geometry.parameters())
-
-
-def test_files_that_are_no_textures(tmp_path: Path) -> None:
-    field, path = saved_texture(tmp_path)
-    with pytest.raises(InputError, match=r"no such file; expected a texture written by `mplicits texture`"):
-        load_texture(tmp_path / "none.safetensors", field.geometry)
-    with pytest.raises(InputError, match="a safetensors file, but not a field"):
-        load_field(path)
-    save_field(tmp_path / "f.safetensors", field.geometry)
-    with pytest.raises(InputError, match="a safetensors file, but not a texture"):
-        load_texture(tmp_path / "f.safetensors", field.geometry)
-    path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(InputError, match=r"t\.safetensors: damaged, or not a texture"):
-        load_texture(path, field.geometry)
-    with torch.no_grad():
-        field.network.siren.output.bias.fill_(float("inf"))
-    save_texture(path, field)
-    with pytest.raises(InputError, match=r"'siren\.output\.bias' has NaN"):
-        load_texture(path, field.geometry)

@@ -1,9 +1,8 @@
 """Values kept on a grid: what they interpolate exactly, how far off they may be, and what is brought up to date."""
 
-import pytest
 import torch
 from mplicits.neural_fields import Sphere
-from mplicits.neural_fields.fields.function import as_field
+from mplicits.neural_fields.fields.field import as_field
 from mplicits.neural_fields.networks.value_grid import ValueGrid
 from torch import Tensor
 
@@ -55,9 +54,3 @@ def test_the_near_part_is_that_around_the_kept_surface() -> None:
     assert torch.equal(grid.kept[~near], before[~near])
     grid.refresh(Sphere(radius=0.6))
     assert float(grid.moved) == 0.0  # what was far off, and out of date, does not count
-
-
-@pytest.mark.parametrize(("resolution", "reach"), [(0, 0.1), (8, 0.0)])
-def test_sizes_out_of_range_are_refused(resolution: int, reach: float) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        ValueGrid(resolution, reach=reach)

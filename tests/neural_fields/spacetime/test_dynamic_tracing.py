@@ -4,7 +4,7 @@ import pytest
 import torch
 from fields import SCREW, Watched, small_multiscale, small_spacetime
 from mplicits.datasets.cameras import look_at
-from mplicits.neural_fields import Field, Moving, RigidMotion, Sphere, TimeSlice, Torus, Union, at_time, sphere_trace
+from mplicits.neural_fields import Field, Moving, RigidMotion, Sphere, TimeSlice, Torus, Union, sphere_trace
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
 from mplicits.neural_fields.tracing.cones import cone_ends
 from mplicits.neural_fields.tracing.sphere import Expected, trace_expected
@@ -132,14 +132,6 @@ def test_wrong_expectations_change_nothing_but_the_cost():
         assert float((found.depth - fresh.depth)[found.mask].abs().max()) < 2e-5
 
 
-def test_the_slope_of_a_hit_is_how_fast_the_field_falls():
-    eye, directions = image(dtype=torch.float64)
-    found, slope, _ = trace_expected(Sphere(radius=0.6).double(), eye, directions, None, tolerance=1e-4)
-    exact = -(torch.nn.functional.normalize(found.position, dim=-1) * directions).sum(dim=-1)
-    facing = found.mask & (exact > 0.3)
-    assert float((slope - exact)[facing].abs().median()) < 0.02
-
-
 def test_tiles_are_empty_behind_their_ends():
     eye, directions = image(64, dtype=torch.float64)
     balls = Union(ball(0.3, (0.3, 0.0, 0.0), (0, 0, 0)), ball(0.2, (-0.5, 0.2, -0.3), (0, 0, 0)))
@@ -152,24 +144,6 @@ def test_tiles_are_empty_behind_their_ends():
         seen = ends.isfinite()
         assert float(field.value(eye + behind[..., None] * directions)[seen].min()) > 0
     assert bool(cone_ends(field, eye, directions, ~everything).isinf().all())
-
-
-def test_a_frame_costs_less_than_from_scratch():
-    eye, directions = image(128)
-    field = Watched(Moving(Torus(major=0.5, minor=0.2), RigidMotion(axis=(1.0, 1.0, 0.0), angle=1.0)))
-    settings = {"tolerance": 1e-3, "resolution": 5e-3}
-    tracer = DynamicTracer(field, eye, directions, **settings)
-    times = [k / 96 for k in range(6)]
-    for t in times[:2]:
-        tracer.trace(t)
-    field.values.clear()
-    for t in times[2:]:
-        tracer.trace(t)
-    warm = field.counts()[0]
-    field.values.clear()
-    for t in times[2:]:
-        sphere_trace(TimeSlice(field, t), eye, directions, **settings)
-    assert warm < 0.55 * field.counts()[0]
 
 
 def test_near_is_where_rays_pass_within_reach():
@@ -241,20 +215,3 @@ def test_without_reach_every_frame_is_a_key_frame():
     keys = {tracer._key.time for t in TIMES[:4] if tracer.trace(t) is not None}
     assert len(keys) == 4
     assert assert_same(field, TIMES, tracer, eye, directions, tolerance=1e-5) > 1000
-
-
-def test_a_moment_is_the_slice():
-    torch.manual_seed(0)
-    x = 2 * torch.rand(100, 3) - 1
-    for field in (small_spacetime(), Moving(Sphere(), SCREW)):
-        torch.testing.assert_close(moment(field, 0.3).value(x), field.value(at_time(x, 0.3)))
-
-
-def test_bad_arguments_are_named():
-    eye, directions = image(8)
-    with pytest.raises(ValueError, match=r"in_dim=3"):
-        DynamicTracer(Sphere(), eye, directions)
-    with pytest.raises(ValueError, match=r"tolerance=0"):
-        DynamicTracer(ball(0.3, (0, 0, 0), (0, 0, 0)), eye, directions, tolerance=0.0).trace(0.0)
-    with pytest.raises(ValueError, match=r"reach=-1"):
-        DynamicTracer(ball(0.3, (0, 0, 0), (0, 0, 0)), eye, directions, reach=-1.0)

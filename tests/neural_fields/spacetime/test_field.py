@@ -1,7 +1,6 @@
 """Fields of space-time: slices, embedding of static fields, moving fields in closed form, second derivatives."""
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -20,12 +19,7 @@ from mplicits.neural_fields import (
     TimeSlice,
     Torus,
     at_time,
-    extract_mesh,
-    load_field,
-    save_field,
-    sphere_trace,
 )
-from mplicits.neural_fields.spacetime.field import spacetime_jet
 from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from torch import Tensor
 
@@ -93,41 +87,11 @@ def test_the_time_folds_into_the_biases(taper: float, dtype: torch.dtype) -> Non
     assert_within(frozen.value(x), part.value(x), 2 * off[0])
 
 
-def test_a_moment_is_saved_as_a_static_field(tmp_path: Path) -> None:
-    frozen = small_spacetime(0.2).at(0.6)
-    save_field(tmp_path / "frame.safetensors", frozen)
-    x = torch.rand(100, 3)
-    assert torch.equal(load_field(tmp_path / "frame.safetensors").field.value(x), frozen.value(x))
-
-
 def test_levels_that_are_no_sirens_are_sliced_too() -> None:
     sdf = MultiscaleSDF(Moving(Sphere(), TRAVEL), [Siren(16, 1, omega=5.0, in_dim=4)], [0.2])
     part, x = TimeSlice(SpaceTimeSDF(sdf).double(), 0.8), box_points(300)
     off = rounding(part, x, lambda field, x: [field.value(x)])[0]
     assert_within(SpaceTimeSDF(sdf).at(0.8).value(x), part.value(x), 2 * off)
-
-
-@pytest.mark.parametrize("t", [0.0, 0.5, 1.0])
-def test_slices_are_traced(t: float) -> None:
-    part = TimeSlice(Moving(Sphere(radius=0.3), TRAVEL), t)
-    center = TRAVEL.forward(torch.zeros(3), t)
-    offsets = 0.5 * torch.rand(400, 2) - 0.25
-    origins = torch.cat((center[:2] + offsets, torch.full((400, 1), -3.0)), dim=1)
-    hits = sphere_trace(part, origins, torch.tensor([0.0, 0.0, 1.0]), radius=None)
-    squared = 0.3**2 - offsets.square().sum(dim=-1)
-    assert torch.equal(hits.mask, squared > 0)
-    depth = 3 + center[2] - squared[hits.mask].sqrt()
-    torch.testing.assert_close(hits.depth[hits.mask], depth, rtol=0, atol=2e-5)
-
-
-def test_slices_are_meshed() -> None:
-    mesh = extract_mesh(TimeSlice(Moving(Sphere(radius=0.4), TRAVEL), 0.6), resolution=48)
-    center = TRAVEL.forward(torch.zeros(3, dtype=torch.float64), 0.6).numpy()
-    distance = ((mesh.vertices - center) ** 2).sum(axis=1) ** 0.5
-    assert abs(distance - 0.4).max() < 3e-4
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] - center for k in range(3))
-    volume = (a * torch.linalg.cross(torch.from_numpy(b), torch.from_numpy(c)).numpy()).sum() / 6
-    assert volume == pytest.approx(4 / 3 * math.pi * 0.4**3, rel=0.01)
 
 
 # Embedding
@@ -158,40 +122,6 @@ def test_an_embedded_field_starts_to_move_at_once() -> None:
     assert bool((first[:16, 3] != 0).all())
     output = field.sdf.base.output.weight.grad  # pyright: ignore
     assert bool((output != 0).all())
-
-
-def test_time_gain_slows_the_start_down() -> None:
-    torch.manual_seed(0)
-    fast = SpaceTimeSDF.from_widths([(32, 2)], omegas=[10])
-    torch.manual_seed(0)
-    slow = SpaceTimeSDF.from_widths([(32, 2)], omegas=[10], time_gain=0.25)
-    a, b = (field.sdf.base.layers[0].weight for field in (fast, slow))  # pyright: ignore
-    assert torch.equal(a[:, :3], b[:, :3])
-    torch.testing.assert_close(0.25 * a[:, 3], b[:, 3])
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: SpaceTimeSDF(small_multiscale()), "field.in_dim=3: expected a field of space-time"),
-        (lambda: TimeSlice(Sphere(), 0.5), "field.in_dim=3: expected a field of space-time"),
-        (lambda: TimeSlice(small_spacetime(), torch.rand(2)), r"t has shape \(2,\)"),
-        (lambda: SpaceTimeSDF.from_static(Sphere()), "a level of the field is a Sphere"),
-        (lambda: SpaceTimeSDF.from_static(small_spacetime()), "expected a static field"),
-        (lambda: SpaceTimeSDF.from_static(small_multiscale(), extra_width=-1), "extra_width=-1"),
-        (lambda: spacetime_jet(small_spacetime(), torch.rand(2, 4), order=3), "order=3"),
-        (lambda: Keyframes([0.0, 0.0], [Sphere(), Sphere()]), "expected increasing numbers"),
-        (lambda: Keyframes([0.0], []), "1 times for 0 fields"),
-        (lambda: Keyframes([0.0], [small_spacetime()]), r"fields\[0\].in_dim=4"),
-        (lambda: Moving(small_spacetime(), SCREW), "expected a static field"),
-        (lambda: RigidMotion(axis=(0.0, 0.0, 0.0)), "non-zero length"),
-        (lambda: ShrinkingSphere(radius=0.5, alpha=0.1), "radius² > 4 alpha"),
-        (lambda: Sphere().second_jet(torch.rand(2, 3), dims=4), "dims=4: expected 1 to 3"),
-    ],
-)
-def test_bad_arguments(make: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make()  # pyright: ignore[reportCallIssue]
 
 
 # Moving fields in closed form

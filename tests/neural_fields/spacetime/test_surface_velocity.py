@@ -37,10 +37,3 @@ def test_points_of_a_sphere_that_shrinks_go_inward():
     field, towards = ShrinkingSphere(radius=0.8, alpha=0.12), torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
     end = flow(CarriedVelocity(field), 0.8 * towards, 0.0, 1.0)
     torch.testing.assert_close(end, 0.4 * towards, atol=1e-4, rtol=0)
-
-
-def test_bad_arguments_are_named():
-    with pytest.raises(ValueError, match="nodes=1"):
-        CarriedVelocity(ShrinkingSphere(), nodes=1)
-    with pytest.raises(ValueError, match="in_dim=3"):
-        CarriedVelocity(Sphere())

@@ -107,8 +107,3 @@ def test_still_it_is_the_blend_and_at_the_keys_the_shapes() -> None:
     for time in (0.0, 1.0):
         at = at_time(x[:, :3], time)
         torch.testing.assert_close(wild.value(at), keys.value(at), rtol=0, atol=1e-14)
-
-
-def test_steps_are_checked() -> None:
-    with pytest.raises(ValueError, match="steps=0"):
-        CarriedKeyframes(Keyframes([0.0], [Sphere()]), VelocitySiren(), steps=0)

@@ -4,9 +4,8 @@ import math
 
 import pytest
 import torch
-from mplicits.neural_fields import Plane, Sphere
+from mplicits.neural_fields import Sphere
 from mplicits.neural_fields.volume.weights import (
-    composite,
     importance_depths,
     invert_outside,
     neus_alpha,
@@ -157,19 +156,3 @@ class TestDepths:
     def test_inverted_points_lie_in_the_unit_box(self) -> None:
         inverted = invert_outside(torch.tensor([[0.0, 0.0, 4.0], [3.0, 0.0, 4.0]]))
         torch.testing.assert_close(inverted, torch.tensor([[0, 0, 1, 0.25], [0.6, 0, 0.8, 0.2]]))
-
-
-def test_composite_agrees_with_a_loop() -> None:
-    weights, values = torch.rand(4, 6), torch.rand(4, 6, 3)
-    looped = torch.stack([sum(weights[r, s] * values[r, s] for s in range(6)) for r in range(4)])  # pyright: ignore[reportArgumentType, reportCallIssue]
-    torch.testing.assert_close(composite(weights, values), looped)
-
-
-def test_a_plane_field_gives_the_same_weights_as_its_closed_form() -> None:
-    plane = Plane(normal=(0.0, 0.0, 1.0), offset=0.2).double()
-    middle, value, slope, interval = along_plane(0.8, 0.0, 100)
-    points = torch.tensor([0.0, 0.0, 1.0], dtype=F64) - middle[..., None] * torch.tensor([0.0, 0.0, 1.0], dtype=F64)
-    jet = plane.jet(points)
-    torch.testing.assert_close(jet.value, value)
-    torch.testing.assert_close(-jet.gradient[..., 2], slope)
-    assert float(interval.sum()) == pytest.approx(2)

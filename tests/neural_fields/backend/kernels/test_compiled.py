@@ -26,7 +26,7 @@ from triton.backends.compiler import GPUTarget
 from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 
-sizes, capability, training = json.loads(sys.argv[1])
+sizes, capability, of_training = json.loads(sys.argv[1])
 
 class Stub:  # all that binding and compiling ask of a driver
     def get_current_device(self):
@@ -63,7 +63,7 @@ original, JITFunction.run = JITFunction.run, compile_only
 
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import MultiscaleSDF
-from mplicits.neural_fields.backend.kernels import ieee, levels, packing, siren, training as back
+from mplicits.neural_fields.backend.kernels import levels, packing, siren, training
 from mplicits.neural_fields.backend.kernels.launch import Network
 from mplicits.neural_fields.networks.multiscale import as_levels
 from mplicits.neural_fields.tracing import picture
@@ -72,10 +72,10 @@ from mplicits.pipelines.render import trace
 packing.is_hopper = lambda device: capability == 90
 field = MultiscaleSDF.from_widths(sizes, omegas=[30.0] * len(sizes), taper=0.3).requires_grad_(False)
 x, depth = torch.rand(100, 3), torch.rand(100)
-if training:
+if of_training:
     network = Network.of(field.base.raw(), 30.0, 1.0)
-    ieee.jet(x, network)
-    back.jet_backward(x, network, depth, x)
+    training.jet(x, network)
+    training.jet_backward(x, network, depth, x)
 else:
     siren.siren_value(x, packing.packed(field.base))
     siren.siren_jet(x, packing.packed(field.base))
@@ -138,7 +138,7 @@ def test_kernels_compile(sizes: list[tuple[int, int]], capability: int) -> None:
 def test_jets_of_training_compile(size: tuple[int, int], capability: int) -> None:
     """Their products are those of float32 units."""
     found = compiled([size], capability, training=True)
-    assert set(found) == {"ieee.evaluate", "training.sweep"}
+    assert set(found) == {"training.evaluate", "training.sweep"}
     for kernel in found.values():
         assert kernel["shared"] <= SHARED[capability]
         assert (kernel["fast"], kernel["tensor"]) == (0, 0)

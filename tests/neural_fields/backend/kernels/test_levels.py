@@ -165,17 +165,3 @@ def test_what_the_launch_cannot_do_is_done_level_by_level(place: torch.device, c
     assert counted == []
     with_features.value(x)
     assert counted == ["levels_value"]
-
-
-def test_a_gate_that_is_a_little_wrong_would_be_noticed(place: torch.device) -> None:
-    """A taper a hundredth off is told from rounding, so that the tests above can fail."""
-    field, x = levels([0.4], place, taper=0.5, sizes=SIZES[:2]), points(60, place)
-    field.taper = 0.505
-    exact = exact_copy(field)
-    field.taper = 0.5
-    off = (field.value(x).cpu().double() - exact.value(x.double().cpu())).abs()
-    own = [part for part in field.levels if isinstance(part, Siren)]
-    bounds = [rounding_bound(x.cpu(), [p.cpu() for p in one.raw()], one.omega, halves=True) for one in own]
-    jets = [part.jet(x.double().cpu()) for part in exact.levels]
-    _, bound, _ = gated_bound([(j.value, j.gradient) for j in jets], bounds, exact.deltas, 0.5)
-    assert bool((off > bound).any())

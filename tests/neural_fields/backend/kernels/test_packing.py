@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 from bounds import assert_within, unit_roundoff
 from mplicits.neural_fields import Siren
-from mplicits.neural_fields.backend.kernels.packing import LARGEST_WEIGHT, SINES, Shape, pack, packed
+from mplicits.neural_fields.backend.kernels.packing import LARGEST_WEIGHT, SINES, pack, packed
 from mplicits.neural_fields.backend.kernels.tensor_tiles import cosine, sine
 
 from benchmarks.costs.rounding import COSINE_ERROR, SINE_ERROR
@@ -76,15 +76,3 @@ def test_weights_made_in_inference_mode_are_packed_each_time() -> None:
         before = packed(network).floats.clone()
         network.layers[0].weight.mul_(2)
         assert not torch.equal(packed(network).floats, before)
-
-
-def test_shapes() -> None:
-    """Whole accumulators; what is kept in scratch follows from depth and width."""
-    assert Shape.of(20, 2) == (32, 2, 32, 32, 64, True)
-    assert Shape.of(128, 2).scratch(64, jet=True) == 0
-    assert Shape.of(256, 2) == (256, 2, 256, 32, 128, False)
-    assert Shape.of(256, 2, hopper=False) == (256, 2, 128, 64, 64, False)
-    assert Shape.of(400, 2) == (512, 2, 128, 64, 128, False)
-    assert Shape.of(128, 4).scratch(64, jet=False) == 2 * 2 * 64 * 128
-    assert Shape.of(128, 4).scratch(64, jet=True) == 2 * 4 * 64 * 128
-    assert [Shape.of(128, depth).kept for depth in (1, 2, 3)] == [False, True, False]

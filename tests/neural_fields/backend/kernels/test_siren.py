@@ -8,7 +8,6 @@ import pytest
 import torch
 from bounds import assert_within, rounding
 from mplicits.neural_fields import Siren
-from mplicits.neural_fields.backend.kernels.tiles import planes
 
 from benchmarks.costs.rounding import rounding_bound
 
@@ -83,15 +82,6 @@ def test_points_of_any_shape_and_dimension(place: torch.device) -> None:
     assert network.jet(x[:0].reshape(0, 5, 4)).features.shape == (0, 5, 0)
 
 
-def test_units_of_parameters_change_nothing(place: torch.device) -> None:
-    network, x = siren(24, 2, place), points(70, place)
-    before = network.jet(x)
-    network.set_units(sines=0.25, output=8.0)
-    after = network.jet(x)
-    assert torch.equal(before.value, after.value)
-    assert torch.equal(before.gradient, after.gradient)
-
-
 def test_large_phases_keep_their_digits(place: torch.device) -> None:
     """Phases of some thousands: a sine of limited range would be off by far more than the bound."""
     network = siren(16, 2, place, omega=3000.0)
@@ -126,8 +116,3 @@ def test_a_bound_that_is_no_bound_would_be_noticed(place: torch.device) -> None:
     after = network.jet(x)
     assert bool(((before.value - after.value).abs() > value_bound).any())
     assert bool(((before.gradient - after.gradient).abs() > gradient_bound).any())
-
-
-def test_planes() -> None:
-    """The matrices that a training's jet puts aside, as its doc says."""
-    assert [planes(depth) for depth in (1, 2, 3, 5)] == [2, 2, 3, 5]

@@ -153,11 +153,3 @@ def test_one_network_too_wide_for_registers(
     ours, theirs = both(field, origins, directions, monkeypatch, **COARSE)
     assert counted == [-20]
     assert_same(ours, theirs, field, directions, COARSE["tolerance"])
-
-
-def test_few_steps_end_where_they_are(place: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
-    field, (origins, directions) = ball(place), rays(40, place)
-    ours, theirs = both(field, origins, directions, monkeypatch, max_steps=2)
-    assert int(ours.steps.max()) == 2
-    # Two steps of balls: nothing but rounding of values between them.
-    assert float((ours.depth - theirs.depth).abs().max()) <= 1e-4

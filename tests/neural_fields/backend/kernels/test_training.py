@@ -114,22 +114,3 @@ def test_twice(place: torch.device) -> None:
     expected = bend(exact, x.detach().double().cpu().requires_grad_())
     for one, other in zip(bend(network, x), expected, strict=True):
         assert_within(one.cpu(), other, 1e-5 * other.abs().max())
-
-
-def test_a_fit_of_some_steps_is_pytorchs(place: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
-    def trained() -> Siren:
-        torch.manual_seed(1)
-        network, x = Siren(16, 2, omega=5.0).to(place), (2 * torch.rand(50, 3) - 1).to(place)
-        for _ in range(2):
-            value, gradient, _ = network.jet(x)
-            error = ((value - x.norm(dim=-1) + 0.5).square() + (gradient.norm(dim=-1) - 1).square()).mean()
-            for parameter, slope in zip(
-                network.parameters(), torch.autograd.grad(error, list(network.parameters())), strict=True
-            ):
-                parameter.data -= 1e-2 * slope
-        return network
-
-    ours = trained()
-    monkeypatch.setenv("MPLICITS_KERNELS", "off")
-    for one, other in zip(ours.parameters(), trained().parameters(), strict=True):
-        assert_within(one, other, 1e-6)  # steps are below 1e-1, and exact to a few roundings of 6e-8

@@ -1,22 +1,216 @@
-"""Finding the few cells that a surface crosses: culled blocks first, then signs at the corners of what is left.
+"""The cells of a lattice that a surface crosses, and the 256 cases of marching cubes (Lorensen and Cline 1987).
 
-All indices are lattice points (see `Lattice`). The search ends at blocks of 2³ cells, whose centre is itself a
-lattice point, so that no value of it is thrown away.
+All indices are lattice points (see `Lattice`). Blocks of cells are culled down to 2³ cells, whose centre is itself a
+lattice point; then signs at the corners of the remaining blocks are found.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from ._cube import CORNERS, cube_tables
-from ._lattice import Lattice, Sampler
+from ..fields.field import Field
 
-__all__ = ["ActiveCells", "NoSurfaceError", "active_cells", "cull_blocks"]
+Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Cubic cells of edge ``step`` from ``low`` upwards; ``shape`` counts cells, so there are ``shape + 1`` points."""
+
+    low: tuple[float, float, float]
+    step: float
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def over(cls, bounds: Bounds, resolution: int) -> Lattice:
+        """The lattice with ``resolution`` cells along the longest axis of a box; other axes round up to whole cells.
+
+        ValueError if the box is empty or not finite, or for fewer than two cells.
+        """
+        low, high = (np.asarray(corner, np.float64) for corner in bounds)
+        if low.shape != (3,) or high.shape != (3,) or not np.isfinite([low, high]).all() or not (low < high).all():
+            raise ValueError(
+                f"bounds={bounds}: expected two corners of three finite numbers, the first below the second"
+            )
+        if resolution < 2:
+            raise ValueError(f"resolution={resolution}: expected at least 2 cells along the longest axis")
+        step = float((high - low).max()) / resolution
+        # A millionth of a cell is rounding, not a reason for another layer.
+        x, y, z = (max(1, math.ceil(extent / step - 1e-6)) for extent in high - low)
+        return cls((float(low[0]), float(low[1]), float(low[2])), step, (x, y, z))
+
+    def positions(self, index: NDArray[np.integer] | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coordinates of points ``(N, 3)`` counted in cells, whole or not."""
+        return np.asarray(index, np.float64) * self.step + np.asarray(self.low)
+
+    def __str__(self) -> str:
+        """The box, for messages."""
+        high = self.positions(np.asarray(self.shape))
+        return " × ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(self.low, high, strict=True))
+
+
+class Sampler:
+    """Evaluates a field at lattice points in batches of ``batch`` rows, checks that values are finite, and counts.
+
+    ``progress(stage, done, total)`` is called after every batch; ``counts`` holds the points sent to each level so far.
+    """
+
+    def __init__(self, field: Field, lattice: Lattice, batch: int, progress: Progress | None = None) -> None:
+        self.field, self.lattice, self.batch, self.progress = field, lattice, batch, progress
+        self.counts = [0] * field.num_levels
+        self._like = field.like
+
+    def _points(self, positions: NDArray[np.float64]) -> torch.Tensor:
+        return torch.from_numpy(positions).to(self._like)
+
+    @torch.inference_mode()
+    def values(
+        self, count: int, points: Callable[[slice], NDArray[np.integer]], *, level: int, stage: str
+    ) -> NDArray[np.floating]:
+        """Values at ``count`` lattice points → ``(count,)``, in the field's dtype; ValueError if one is not finite.
+
+        ``points`` returns a part of them, ``(n, 3)``, when it is needed, so that they never exist all at once.
+        """
+        parts = [np.empty(0, np.float32)]
+        for start in range(0, count, self.batch):
+            positions = self.lattice.positions(points(slice(start, start + self.batch)))
+            part = self.field.value(self._points(positions), level=level).cpu().numpy()
+            self._check(part, positions, level)
+            self._report(level, stage, start + len(part), count, len(part))
+            parts.append(part)
+        return np.concatenate(parts[1:] or parts)
+
+    @torch.inference_mode()
+    def jets(
+        self, positions: NDArray[np.float64], *, level: int, stage: str
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Values ``(N,)`` and gradients ``(N, 3)`` at positions ``(N, 3)``; ValueError if one is not finite."""
+        values = [np.empty(0, np.float32)]
+        gradients = [np.empty((0, 3), np.float32)]
+        for start in range(0, len(positions), self.batch):
+            batch = positions[start : start + self.batch]
+            jet = self.field.jet(self._points(batch), level=level)
+            values.append(jet.value.cpu().numpy())
+            gradients.append(jet.gradient.cpu().numpy())
+            self._check(values[-1] + gradients[-1].sum(axis=1), batch, level)
+            self._report(level, stage, start + len(batch), len(positions), len(batch))
+        return np.concatenate(values[1:] or values), np.concatenate(gradients[1:] or gradients)
+
+    def _check(self, values: NDArray[np.floating], positions: NDArray[np.float64], level: int) -> None:
+        bad = ~np.isfinite(values)
+        if bad.any():
+            where = ", ".join(f"{c:.4g}" for c in positions[bad.argmax()])
+            raise ValueError(
+                f"field: level {level} is not finite at {bad.sum()} of {len(values)} points, first at ({where}); "
+                "its parameters have probably diverged"
+            )
+
+    def _report(self, level: int, stage: str, done: int, total: int, count: int) -> None:
+        self.counts[level] += count
+        if self.progress is not None:
+            self.progress(stage, done, total)
+
+
+CORNERS: NDArray[np.int64] = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])  # (8, 3)
+_EDGES = [(c, c | 1 << axis, axis) for axis in range(3) for c in range(8) if not c >> axis & 1]
+EDGE_ENDS: NDArray[np.int64] = np.array([(a, b) for a, b, _ in _EDGES])  # (12, 2), the lower corner first
+EDGE_AXIS: NDArray[np.int64] = np.array([axis for _, _, axis in _EDGES])  # (12,)
+_EDGE_OF = {frozenset((a, b)): index for index, (a, b, _) in enumerate(_EDGES)}
+
+
+def _faces() -> list[tuple[int, int, int, int]]:
+    """Corners of the six faces, counter-clockwise as seen from outside the cube."""
+    faces = []
+    for axis in range(3):
+        u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
+        low, high = 0, 1 << axis
+        faces += [(high, high | u, high | u | v, high | v), (low, low | v, low | u | v, low | u)]
+    return faces
+
+
+_FACES = _faces()
+_EDGE_FACES = [frozenset(i for i, face in enumerate(_FACES) if {a, b} <= set(face)) for a, b, _ in _EDGES]
+
+
+class CubeTables(NamedTuple):
+    """What a case byte means: bit c says that corner c is inside."""
+
+    crossed: NDArray[np.bool_]  # (256, 12), edges whose ends differ in sign
+    ends: NDArray[np.bool_]  # (256, 8), corners at the end of a crossed edge
+    start: NDArray[np.int64]  # (257,) first row of each case in `triangles`
+    triangles: NDArray[np.int64]  # (T, 3) edge numbers, counter-clockwise as seen from the positive side
+
+
+def _loops(case: int) -> list[list[int]]:
+    """The closed polygons of a case, as edge numbers, counter-clockwise as seen from the positive side."""
+    follow: dict[int, int] = {}
+    for face in _FACES:
+        inside = [bool(case >> corner & 1) for corner in face]
+        for i in range(4):
+            if inside[i - 1] or not inside[i]:
+                continue
+            j = i
+            while inside[(j + 1) % 4]:
+                j += 1
+            enter = _EDGE_OF[frozenset((face[i - 1], face[i]))]
+            leave = _EDGE_OF[frozenset((face[j % 4], face[(j + 1) % 4]))]
+            follow[enter] = leave
+    loops = []
+    while follow:
+        loop = [next(iter(follow))]
+        while (edge := follow.pop(loop[-1])) != loop[0]:
+            loop.append(edge)
+        loops.append(loop)
+    return loops
+
+
+def _cut(loop: list[int]) -> list[tuple[int, int, int]]:
+    """Triangulate a polygon with the fewest diagonals in a face, where the neighbour might place the same one."""
+
+    @cache
+    def best(i: int, j: int) -> tuple[int, tuple[tuple[int, int, int], ...]]:
+        if j - i < 2:
+            return 0, ()
+        options = []
+        for k in range(i + 1, j):
+            left, right = best(i, k), best(k, j)
+            options.append((left[0] + right[0], (*left[1], (loop[i], loop[k], loop[j]), *right[1])))
+        closing = (i, j) == (0, len(loop) - 1)
+        flat = 0 if closing else bool(_EDGE_FACES[loop[i]] & _EDGE_FACES[loop[j]])
+        cost, triangles = min(options, key=lambda option: option[0])
+        return cost + flat, triangles
+
+    return list(best(0, len(loop) - 1)[1])
+
+
+@cache
+def cube_tables() -> CubeTables:
+    """Derive the 256 cases from one rule per face instead of typing them in; a few milliseconds, once.
+
+    On each face, walked counter-clockwise from outside, every crossing from outside to inside is joined to the next one
+    back. Two cubes that share a face draw the same segments on it, so the surface has no cracks. Each crossed edge is
+    entered on one of its faces and left on the other, so segments close into loops, which are cut into triangles.
+    """
+    inside = (np.arange(256)[:, None] >> np.arange(8) & 1).astype(bool)
+    crossed = inside[:, EDGE_ENDS[:, 0]] != inside[:, EDGE_ENDS[:, 1]]
+    ends = np.zeros((256, 8), bool)
+    for edge, (a, b) in enumerate(EDGE_ENDS):
+        ends[:, a] |= crossed[:, edge]
+        ends[:, b] |= crossed[:, edge]
+    cases = [[triangle for loop in _loops(case) for triangle in _cut(loop)] for case in range(256)]
+    start = np.concatenate(([0], np.cumsum([len(case) for case in cases])))
+    triangles = np.array([triangle for case in cases for triangle in case])
+    return CubeTables(crossed, ends, start, triangles)
+
 
 Ints = NDArray[np.integer]
 Floats = NDArray[np.floating]
@@ -31,38 +225,27 @@ class NoSurfaceError(ValueError):
 
 @dataclass(frozen=True)
 class ActiveCells:
-    """The cells that the surface crosses.
+    """The cells that the surface crosses."""
 
-    Attributes:
-        cases: ``(C,)`` uint8 case of each cell (see `cube_tables`).
-        corners: ``(8, C)`` rows of ``points``.
-        points: ``(P, 3)`` lattice points.
-        values: ``(P,)`` their values; only those at the end of a crossed edge mean anything.
-    """
-
-    cases: NDArray[np.uint8]
-    corners: NDArray[np.int32]
-    points: Ints
-    values: Floats
+    cases: NDArray[np.uint8]  # (C,) case of each cell (see `cube_tables`)
+    corners: NDArray[np.int32]  # (8, C) rows of `points`
+    points: Ints  # (P, 3) lattice points
+    values: Floats  # (P,) their values, valid at the ends of crossed edges
 
 
 def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints, Floats, NDArray[np.bool_]]:
     """Halve blocks from about 1/32 of the box down to 2³ cells, dropping those that cannot hold a zero.
 
-    A stage with blocks of half diagonal r asks level j only at the block centres c and keeps those with
+    A stage with blocks of half diagonal r evaluates level j at the block centres c and keeps those with
 
         |f_j(c)| ≤ L r + δ_j,
 
-    because a zero p of the target has |f_j(p)| < δ_j (it is in level j's band) and |f_j(c) − f_j(p)| ≤ L r. The
-    level is the first one with 4 δ_j ≤ L r: a finer one would cull little more; for the target δ is 0. Two
-    neighbouring centres with opposite signs are both kept whatever they say, since there the bound is violated.
+    because a zero p of the target has |f_j(p)| < δ_j and |f_j(c) − f_j(p)| ≤ L r. The level is the first with 4 δ_j ≤ L
+    r: a finer one would cull little more; for the target δ is 0. Neighbouring centres of opposite signs are both kept,
+    since there the bound is violated.
 
-    Returns:
-        Of the blocks of 2³ cells that were looked at: origins ``(B, 3)``, target values at the centres ``(B,)``, and
-        which survived ``(B,)``. The others still bound the field around them.
-
-    Raises:
-        NoSurfaceError: nothing survives.
+    Returns, of all blocks of 2³ cells evaluated: origins ``(B, 3)``, target values at the centres ``(B,)``, and which
+    survived ``(B,)``; the others still bound the field. Raises NoSurfaceError if none survives.
     """
     lattice = sampler.lattice
     deltas = [float(delta) for delta in sampler.field.deltas[:level]]
@@ -86,7 +269,7 @@ def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints
 
 
 def _beside_other_sign(cells: Ints, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of the ``cells`` (N, 3) have one of their six neighbours in the list with the other sign."""
+    """Which of the ``cells`` ``(N, 3)`` have one of their six neighbours in the list with the other sign."""
     size = cells.max(axis=0) + 2
     strides = np.array([size[1] * size[2], size[2], 1])
     keys = cells @ strides
@@ -115,15 +298,14 @@ def _where_signs_are(values: Floats, points: Ints, lattice: Lattice, sampler: Sa
 def active_cells(
     sampler: Sampler, blocks: Ints, centres: Floats, kept: NDArray[np.bool_], *, level: int, lipschitz: float
 ) -> ActiveCells:
-    """Find the crossed cells of 2³-cell blocks, and exact values at both ends of every crossed edge.
+    """The crossed cells of 2³-cell blocks, with exact values at both ends of every crossed edge.
 
-    The sign at a corner q follows from any known centre c of a block around it with |f(c)| > L |q − c|; only the other
-    corners are evaluated, then the ends of the edges that turn out to be crossed, until nothing is new. Where
-    the surface leaves the blocks through a face, the neighbour there is added and the search goes on, so that
-    the surface is closed inside the box also where the field is steeper than L.
+    The sign at a corner q follows from any known centre c of a block around it with |f(c)| > L |q − c|; only other
+    corners are evaluated, then the ends of crossed edges, until nothing is new. Where the surface leaves the blocks
+    through a face, the neighbour there is added: the surface is closed inside the box also where the field is steeper
+    than L.
 
-    Raises:
-        NoSurfaceError: the blocks hold no sign change.
+    Raises NoSurfaceError if the blocks hold no sign change.
     """
     known: tuple[Ints, Floats] = (np.empty(0, np.int64), centres[:0])
     while True:
@@ -148,8 +330,8 @@ class _Corners:
     """Signs and values at the corner points of a set of 2³-cell blocks.
 
     Every point belongs to the block at its lower end: point ``(2 b + o)`` with ``o`` in {0, 1}³ is number ``o`` of
-    block b. The points on the upper sides belong to the neighbours there, which are listed as owners whether
-    they are blocks of the set or not, so that shared points have one number and no sorting of points is needed.
+    block b. Points on the upper sides belong to the neighbours there, listed as owners whether in the set or not:
+    shared points have one number, and no sorting of points is needed.
     """
 
     def __init__(
@@ -217,7 +399,7 @@ class _Corners:
     def _find_signs(self, seen: Ints, centres: Floats, slope: float) -> None:
         """Bound the field at every point by ``centres ± slope · distance``, and evaluate where that leaves both signs.
 
-        ``seen`` are the keys of all blocks whose centre is known, those outside the set among them.
+        ``seen`` are the keys of all blocks whose centre is known, inside the set or not.
         """
         low, high = np.full_like(self.value, -np.inf), np.full_like(self.value, np.inf)
         for corner in CORNERS:
@@ -280,7 +462,7 @@ class _Corners:
         return self._places(np.unique(np.concatenate(found)), (0, 0, 0))
 
     def known_values(self) -> tuple[Ints, Floats]:
-        """What has been evaluated: keys of points, and their values."""
+        """Keys of all points evaluated, and their values."""
         rows = np.flatnonzero(self.known)
         return self.owners[rows // 8] * 8 + rows % 8, self.value[rows]
 

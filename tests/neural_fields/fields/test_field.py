@@ -6,7 +6,6 @@ import torch
 from mplicits.neural_fields import (
     Field,
     FunctionField,
-    Jet,
     Moving,
     MultiscaleSDF,
     NeuSGeometry,
@@ -33,30 +32,6 @@ def ball(x: Tensor) -> Tensor:
 
 
 ONE = torch.tensor([1.0, 0.0, 0.0])
-
-
-class Ball(Field):
-    """The least that a field can say."""
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        return ball(x)
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        return Jet(ball(x), x / x.norm(dim=-1, keepdim=True), x[..., :0])
-
-
-@pytest.mark.parametrize("field", [FunctionField(ball), Ball()], ids=["function", "subclass"])
-def test_both_are_traced_meshed_and_called(field: Field) -> None:
-    x = torch.rand(20, 3) + 0.1
-    torch.testing.assert_close(field(x), ball(x), rtol=0, atol=0)
-    torch.testing.assert_close(field.jet(x).gradient, x / x.norm(dim=1, keepdim=True))
-    hits = sphere_trace(field, torch.tensor([0.0, 0.0, 2.0]), torch.tensor([0.0, 0.0, -1.0]))
-    assert bool(hits.mask)
-    assert abs(float(hits.depth) - 1.5) < 2e-5  # twice the tolerance
-    mesh = extract_mesh(field, resolution=24)
-    assert abs((mesh.vertices**2).sum(axis=1) ** 0.5 - 0.5).max() < 1e-3
-    residual = MultiscaleSDF(field, [Siren(8, 1, output_gain=0.0)], [0.1])
-    torch.testing.assert_close(residual(x), ball(x), rtol=0, atol=0)
 
 
 def test_functions_are_taken_wherever_fields_are() -> None:
@@ -110,18 +85,6 @@ def test_parameters_of_a_module_are_those_of_the_field() -> None:
 def test_constants_have_no_slope() -> None:
     jet = FunctionField(lambda x: torch.ones(x.shape[:-1])).jet(torch.rand(4, 3))
     assert not jet.gradient.any()
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (lambda x: x.norm(dim=-1, keepdim=True), r"returned \(4, 1\).*expected \(4,\)"),
-        (lambda x: 1.0, "returned float"),
-    ],
-)
-def test_a_function_must_give_a_number_for_each_point(function, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        FunctionField(function).value(torch.zeros(4, 3))
 
 
 def test_what_cannot_be_called_is_refused() -> None:

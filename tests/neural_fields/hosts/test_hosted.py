@@ -44,10 +44,6 @@ def replaced(shell: NeuSGeometry) -> None:
     parameter.data = 0.5 * parameter.data
 
 
-def reloaded(shell: NeuSGeometry) -> None:
-    shell.load_state_dict({name: 0.5 * tensor for name, tensor in shell.state_dict().items()})
-
-
 def stepped(shell: NeuSGeometry) -> None:
     for parameter in shell.parameters():
         parameter.grad = torch.ones_like(parameter)
@@ -60,7 +56,7 @@ CHANGES: dict[str, Callable[[NeuSGeometry, Tensor], object]] = {
     "optimizer step": lambda shell, x: stepped(shell),
     "one parameter": lambda shell, x: halved(next(shell.parameters())),
     "memory of a parameter": lambda shell, x: replaced(shell),
-    "checkpoint": lambda shell, x: reloaded(shell),
+    "checkpoint": lambda shell, x: shell.load_state_dict({k: 0.5 * v for k, v in shell.state_dict().items()}),
     "band": lambda shell, x: halved(shell.get_buffer("field.inner.deltas")),
     "another field": lambda shell, x: setattr(shell, "field", small_multiscale(0.5)),
     "double precision": lambda shell, x: (shell.double(), setattr(x, "data", x.data.double())),
@@ -80,27 +76,36 @@ def test_a_change_between_the_calls_is_seen(change: str) -> None:
     assert len(output) == 50
 
 
+# What happens to an output before the gradient is asked for, and how many points get a jet in all.
+BETWEEN: dict[str, tuple[Callable[[Tensor, Tensor], object], int]] = {
+    "nothing": (lambda output, x: None, 50),
+    "the points are marked": (lambda output, x: x.requires_grad_(), 50),
+    "a backward pass, which frees the graph of both": (lambda output, x: output.square().sum().backward(), 100),
+}
+
+
+@pytest.mark.parametrize("between", BETWEEN)
+def test_the_second_half_has_a_whole_graph(between: str) -> None:
+    (shell, field), x, (act, jets) = counting(), points(), BETWEEN[between]
+    output = shell(x)
+    act(output, x)
+    shell.gradient(x).square().sum().backward()
+    assert field.jets == jets
+    assert all(parameter.grad is not None for parameter in shell.parameters())
+    part = shell(x)[:, :1]  # a slice keeps the whole output alive
+    shell.gradient(x)
+    assert field.jets == jets + 50
+    assert part.requires_grad
+
+
 def test_other_points_of_the_same_values_are_evaluated() -> None:
     shell, field = counting()
     x = points()
-    output = shell(x)
-    other = x.clone()
-    gradient = shell.gradient(other)
+    output, gradient = shell(x), shell.gradient(x.clone())
     assert field.jets == 100
     shell.gradient(x)
     assert field.jets == 150
     assert len(output) == len(gradient)
-
-
-def test_marking_the_points_in_between_is_no_change() -> None:
-    shell, field = counting()
-    x = points()
-    output = shell(x)
-    x.requires_grad_(True)
-    shell.gradient(x).square().sum().backward()
-    assert field.jets == 50
-    assert x.grad is not None
-    assert output.requires_grad
 
 
 def test_an_evaluation_without_graph_does_not_serve_a_training_step() -> None:
@@ -108,21 +113,17 @@ def test_an_evaluation_without_graph_does_not_serve_a_training_step() -> None:
     x = points()
     with torch.no_grad():
         output = shell(x)
-        assert not output.requires_grad
     assert field.jets == 0  # a value was enough
-    gradient = shell.gradient(x)
-    assert field.jets == 50
-    assert gradient.requires_grad
+    assert shell.gradient(x).requires_grad
     graph = shell(x)
     with torch.no_grad():
         assert not shell.gradient(x).requires_grad
-    assert graph.requires_grad
     with torch.inference_mode():
         output = shell(x)
     with torch.no_grad():
-        gradient = shell.gradient(x)
+        assert not shell.gradient(x).is_inference()
     assert output.is_inference()
-    assert not gradient.is_inference()
+    assert graph.requires_grad
 
 
 def test_parameters_thawed_in_between_are_trained() -> None:
@@ -136,27 +137,12 @@ def test_parameters_thawed_in_between_are_trained() -> None:
     assert len(output) == 50
 
 
-def test_a_backward_pass_between_the_calls_leaves_a_whole_graph_for_the_second() -> None:
-    """Autograd frees the graph of both halves at the first backward pass."""
-    shell, field = counting()
-    x = points()
-    output = shell(x)
-    output.square().sum().backward()
-    shell.gradient(x).square().sum().backward()
-    assert field.jets == 100
-    gradient = shell.gradient(x)
-    gradient.square().sum().backward()
-    shell(x).sum().backward()
-    assert field.jets == 200
-
-
 class Watched(Field):
     """Keeps weak references to what its jets return."""
 
     def __init__(self) -> None:
         super().__init__()
         self.inner = Siren(16, 2, num_features=2)
-        self.in_dim, self.num_levels, self.deltas = 3, 1, self.inner.deltas
         self.seen: list[weakref.ref[Tensor]] = []
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
@@ -187,8 +173,7 @@ def test_nothing_outlives_what_the_caller_has(marked: bool, dead: str) -> None:
             del x
         assert field.alive() == 0
         x = points().requires_grad_(marked)
-        output = shell(x)
-        gradient = shell.gradient(x)
+        output, gradient = shell(x), shell.gradient(x)
         assert field.alive() == 1
         del gradient
         assert field.alive() == 0
@@ -197,39 +182,16 @@ def test_nothing_outlives_what_the_caller_has(marked: bool, dead: str) -> None:
         gc.enable()
 
 
-def test_nothing_waits_for_points_that_died() -> None:
-    field = Watched()
-    shell = NeuSGeometry(field)
-    with torch.no_grad():
-        x = points()
-        output = shell(x)
-        del x
-    assert field.alive() == 0
-    assert len(output) == 50
-
-
-def test_slices_of_the_output_keep_the_gradient_waiting() -> None:
-    shell, field = counting()
-    x = points()
-    sdf = shell(x)[:, :1]
-    shell.gradient(x)
-    assert field.jets == 50
-    assert sdf.shape == (50, 1)
-
-
 def test_a_shell_with_something_waiting_can_be_copied_and_saved() -> None:
     shell, _ = counting()
     x = points()
-    output = shell(x)
-    copied = copy.deepcopy(shell)
-    file = io.BytesIO()
+    output, file = shell(x), io.BytesIO()
     torch.save(shell, file)
     file.seek(0)
-    loaded = torch.load(file, weights_only=False)
-    for other in (copied, loaded):
+    for other in (copy.deepcopy(shell), torch.load(file, weights_only=False)):
+        assert set(shell.state_dict()) == set(other.state_dict())
         halved(next(other.parameters()))
         assert not torch.equal(other.gradient(x), shell.field.jet(x).gradient[:, None])
-    assert set(shell.state_dict()) == set(copied.state_dict())
     assert len(output) == 50
 
 

@@ -10,7 +10,7 @@ import pytest
 import standin
 import torch
 from mplicits.neural_fields import Siren
-from mplicits.neural_fields.backend._parallel import (
+from mplicits.neural_fields.backend.devices import (
     LEAST_BLOCKS,
     LEAST_ROWS,
     Step,
