@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -29,14 +29,9 @@ Number = TypeVar("Number", int, float)
 
 @dataclass(frozen=True)
 class Command:
-    """One command.
+    """One command: texts of its help, what adds its arguments to a parser, and what runs it and returns an exit code.
 
-    Attributes:
-        summary: a few words for the list of commands.
-        examples: lines for the end of its help.
-        add_arguments: tells a parser what it takes.
-        run: does it → exit code.
-        description: for its help, where the summary does not say enough.
+    ``description`` is for its own help, where the summary is not enough.
     """
 
     summary: str
@@ -52,14 +47,9 @@ class Stopped(Exception):  # noqa: N818  what happened is no error
 
 @contextmanager
 def stoppable(kept: str = "", *, at_any_time: bool = False) -> Iterator[None]:
-    """Let an interruption of the work inside end the command.
+    """Turn an interruption of the work inside into `Stopped`, whose message is "interrupted; " and ``kept``.
 
-    Args:
-        kept: what is said then, after "interrupted; ".
-        at_any_time: whether that is true of any moment, and not only after a training has written its checkpoint.
-
-    Raises:
-        Stopped: it was interrupted.
+    ``at_any_time``: the message holds at every moment, not only after a training has written its checkpoint.
     """
     from ..training.trainer import Interrupted
 
@@ -75,17 +65,7 @@ def stoppable(kept: str = "", *, at_any_time: bool = False) -> Iterator[None]:
 def training(
     kept: str = "", *, quiet: bool = False, at_any_time: bool = False, board: Path | None = None
 ) -> Iterator[Report | None]:
-    """`stoppable` work with progress bars, unless it is to be ``quiet``.
-
-    Args:
-        kept: see `stoppable`.
-        quiet: no bars.
-        at_any_time: see `stoppable`.
-        board: folder for a TensorBoard log, or None.
-
-    Raises:
-        InputError: see `tensorboard_log`.
-    """
+    """`stoppable` work with progress bars, unless it is ``quiet``, and a TensorBoard log in the folder ``board``."""
     from ..training.progress import progress_bars
 
     with ExitStack() as stack:
@@ -171,13 +151,9 @@ FLAGS: Mapping[str, dict[str, Any]] = {
 
 
 def add_flags(parser: argparse.ArgumentParser, *names: str, of: str = "", **changed: Any) -> None:
-    """Add some of the `FLAGS`.
+    """Add some of the `FLAGS`, ``--out`` also as ``-o``, with ``of`` in front of their help.
 
-    Args:
-        parser: gets them.
-        names: which, ``--out`` also as ``-o``.
-        of: what each is about, in front of its help.
-        changed: what is different from `FLAGS` in this command, its ``help`` above all.
+    ``changed`` replaces options of theirs in this command, its ``help`` above all.
     """
     for name in names:
         options = {**FLAGS[name], **changed}
@@ -217,20 +193,12 @@ def add_settings(
 
 
 def read_settings(arguments: argparse.Namespace, cls: type[T], *, default: str = "default") -> T:
-    """What the arguments say.
-
-    Raises:
-        InputError: see `load_config`.
-    """
+    """The settings of ``--config`` or ``--preset`` with the flags given; raises the InputErrors of `load_config`."""
     return load_config(cls, arguments.config or arguments.preset or default, given_flags(arguments, cls))
 
 
 def new_settings(arguments: argparse.Namespace, cls: type[T], *others: str) -> T | None:
-    """What the arguments say of a new run; None of a resumed one, which has its own settings.
-
-    Raises:
-        InputError: a resumed run got settings, or one of the flags named ``others``; see `load_config`.
-    """
+    """The settings of a new run; None for a resumed one, which keeps its own and refuses flags and ``others``."""
     if not arguments.resume:
         return read_settings(arguments, cls)
     given = arguments.config or arguments.preset or given_flags(arguments, cls)
@@ -240,16 +208,7 @@ def new_settings(arguments: argparse.Namespace, cls: type[T], *others: str) -> T
 
 
 def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
-    """Refuse the first of these flags that was given.
-
-    Args:
-        arguments: of the command.
-        names: of flags that do not go with others.
-        why: what the message says after the flag.
-
-    Raises:
-        InputError: one was.
-    """
+    """Raise an InputError about the first of these flags that was given; ``why`` follows its name in the message."""
     for name in names:
         if getattr(arguments, name, None) not in (None, False):
             raise input_error(f"--{name.replace('_', '-')}: {why}")
@@ -259,11 +218,7 @@ def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> Non
 
 
 def check_output(path: Path | None, suffixes: Sequence[str]) -> None:
-    """Refuse an output file that could not be written, before the long work and not after it.
-
-    Raises:
-        InputError: another extension, a directory stands in its place, or none can come to be there (`check_place`).
-    """
+    """Raise an InputError before any work if a file of one of the suffixes cannot be written at ``path``."""
     if path is None:
         return
     if path.suffix.lower() not in suffixes:
@@ -323,28 +278,19 @@ class _Parser(argparse.ArgumentParser):
 
 @dataclass(frozen=True)
 class Program:
-    """A table of commands with its own name on the command line.
+    """A table of commands with a name, and an overview that ``--help`` prints.
 
-    Attributes:
-        name: what is typed before a command.
-        commands: by name.
-        overview: what ``--help`` prints; ``{commands}`` is replaced by the list of commands.
-        moved: commands of earlier versions, each with what to run instead.
+    ``{commands}`` in the overview is replaced by the list of commands.
     """
 
     name: str
     commands: Mapping[str, Command]
     overview: str
-    moved: Mapping[str, str] = field(default_factory=dict)
 
     def main(self, argv: Sequence[str] | None = None) -> int:
-        """Run one command.
+        """Run one command → 0, 1 (a check failed), 2 (bad input or arguments), 130 (interrupted), 141 (output closed).
 
-        Args:
-            argv: arguments without the program's name; those of the process by default.
-
-        Returns:
-            Exit code: 0, 1 (a check failed), 2 (bad input or arguments) or 130 (interrupted).
+        ``argv`` has no program name; None takes the arguments of the process.
         """
         os.environ.setdefault(*SPINS)
         try:
@@ -396,8 +342,6 @@ class Program:
             print(f"mplicits {version('mplicits')}")
             return 0
         name, *rest = arguments
-        if name in self.moved:
-            raise _UsageError(f"{name}: {self.moved[name]}")
         if name not in self.commands:
             raise _UsageError(f"unknown command {name!r}{closest(name, self.commands)}")
         parser = self.parser(name)

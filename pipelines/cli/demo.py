@@ -12,16 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ...datasets import (
-    STATUE_PLACEMENT,
-    Camera,
-    PointCloud,
-    Statue,
-    orbit,
-    read_cloud,
-    statue_scan,
-    write_cloud_ply,
-)
+from ...datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
 from ...datasets.synthetic.samples import feet_and_normals
 from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.backend.files import check_place
@@ -45,24 +36,12 @@ TILE = (480, 640)
 
 
 def demo(
-    cloud: str | Path | None,
-    out: str | Path,
-    *,
-    config: FitConfig,
-    up: str | None = None,
-    resolution: int = 320,
+    cloud: str | Path | None, out: str | Path, *, config: FitConfig, up: str | None = None, resolution: int = 320
 ) -> int:
-    """Fit a cloud, write its meshes and a picture into ``out``, print figures.
+    """Fit a cloud, write its meshes and a picture into ``out``, and print figures.
 
-    Args:
-        cloud: a point-cloud file; None takes the bundled scan, whose exact distance is known.
-        out: directory for scan.ply (the bundled scan), run/, mesh.ply, mesh.glb and picture.png.
-        config: of the fit.
-        up: axis that points up in the picture, "y" or "z".
-        resolution: of the meshes.
-
-    Raises:
-        InputError: the cloud cannot be used, or ``out`` cannot be made.
+    Without a cloud, the bundled scan is fitted and compared with its exact surface. ``up`` is "y" or "z". Raises an
+    InputError if the cloud cannot be used or ``out`` cannot be made.
     """
     started = time.monotonic()
     out = Path(out)
@@ -125,19 +104,15 @@ def _extract(field: Field, level: int, resolution: int) -> Mesh:
         raise InputError(f"level {level} has no surface ({error}); is the cloud a surface, are its normals?") from error
 
 
-def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity, *, neighbors: int = 4) -> Mesh:
-    """The mesh with each vertex coloured by the nearest points; as it is, where the cloud has no colours.
+def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity) -> Mesh:
+    """The mesh with colours at its vertices: means of the nearest points, weighted by 1 / distance².
 
-    Args:
-        mesh: in unit-sphere coordinates.
-        cloud: in input coordinates.
-        similarity: from one to the other.
-        neighbors: how many points share in a vertex (2 or more), by the inverse of their squared distances.
+    The mesh is in unit-sphere coordinates, the cloud in input coordinates. Without colours the mesh stays as it is.
     """
     points = from_cloud(cloud).moved(similarity)
     if points.colors is None:
         return mesh
-    distance, index = KDTree(points.vertices).query(mesh.vertices, k=neighbors, workers=-1)
+    distance, index = KDTree(points.vertices).query(mesh.vertices, k=4, workers=-1)
     weights = 1 / np.maximum(distance, 1e-9) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
     colors = np.einsum("vk,vkc->vc", weights, points.colors[index])
@@ -153,15 +128,9 @@ def draw_levels(
     up: str,
     drawn: list[Image] | None = None,
 ) -> Image:
-    """The cloud and each level side by side, all from one camera; with the mesh, where that has colours.
+    """The cloud and each level side by side from one camera, and the mesh of the finest if it has colours.
 
-    Args:
-        cloud: in input coordinates.
-        field: whose levels are traced.
-        mesh: of the finest, in unit-sphere coordinates; None leaves it out.
-        similarity: from input to unit-sphere coordinates.
-        up: "y" or "z".
-        drawn: pictures of the first levels from an earlier call, which are not drawn again; new ones are added.
+    ``drawn`` holds the pictures of levels from an earlier call; new ones are appended to it.
     """
     drawn = [] if drawn is None else drawn
     points = from_cloud(cloud).moved(similarity)
@@ -182,10 +151,10 @@ def _traced(field: Field, camera: Camera, level: int) -> Image:
 
 
 @torch.inference_mode()
-def distances_to_surface(field: Field, points: Float64, *, level: int, batch: int = 1 << 18) -> Float64:
+def distances_to_surface(field: Field, points: Float64, *, level: int) -> Float64:
     """First-order distances |f| / |∇f| of ``points`` ``(N, 3)`` to the zero set of a level, in the field's units."""
     parts = []
-    for part in torch.from_numpy(points.astype(np.float32)).split(batch):
+    for part in torch.from_numpy(points.astype(np.float32)).split(1 << 18):
         jet = field.jet(part, level=level)
         parts.append(jet.value.abs() / jet.gradient.norm(dim=-1).clamp(min=1e-6))
     return torch.cat(parts).double().numpy()

@@ -29,12 +29,9 @@ DEVELOPERS = "extra == .dev"
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report.
+    """One line of the report: a topic, and what was found there and what to do.
 
-    Attributes:
-        level: "ok", "note" (works without), "warning" (works, badly) or "error" (does not work).
-        topic: what was looked at.
-        text: what was found and, where it is not "ok", what to do.
+    ``level`` is "ok", "note" (works without), "warning" (works badly) or "error" (does not work).
     """
 
     level: Literal["ok", "note", "warning", "error"]
@@ -43,11 +40,7 @@ class Finding:
 
 
 def examine(folder: Path | None = None) -> list[Finding]:
-    """Look at Python, packages, threads, GPU, speed and disk.
-
-    Args:
-        folder: where runs will be written; the current directory by default.
-    """
+    """Check Python, packages, threads, GPU, speed, and whether ``folder`` (the current directory) can be written."""
     python = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     return [
         Finding("ok", "Python", python),

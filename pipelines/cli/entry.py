@@ -1,6 +1,6 @@
-"""``mplicits COMMAND …``: the table of all commands, and those of a few lines: info, doctor, sample, demo.
+"""``mplicits COMMAND …``: the table of all commands, and the short ones: info, doctor, sample, demo.
 
-Commands load what they need, torch above all, when they run; never for help or for a mistake in the arguments.
+Commands import torch and the like when they run, never for help or a mistake in the arguments.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from ..training.settings import FitConfig, command_line, given_flags, input_erro
 from .common import Command, Program, add_flags, add_settings, between, check_output, read_settings, refuse
 from .draw import ANIMATE, RENDER, SLICE, VIEW
 from .fit import FIT, describe
-from .mesh import EVALUATE, MESH
-from .solids import BOOLEAN, OFFSET
+from .mesh import BOOLEAN, EVALUATE, MESH, OFFSET
 from .train import EVOLVE, RECONSTRUCT, TEXTURE
 from .views import CHECK_CAMERAS, FIND_CAMERAS, FIND_POINTS, SCENE
 from .web import WEB
@@ -37,7 +36,6 @@ examples:
 
 `mplicits COMMAND --help` says more about each; `mplicits --version` prints the version."""
 
-MOVED = {"bench": "benchmarks are not in the package; run `python -m benchmarks NAME` in a checkout of mplicits"}
 
 SOLIDS = ("box", "cylinder", "gear")
 SAMPLES = ("statue", *SOLIDS)
@@ -165,10 +163,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             _info,
         ),
         "doctor": Command(
-            "check this installation and measure this machine",
-            "  mplicits doctor",
-            lambda _parser: None,
-            _doctor,
+            "check this installation and measure this machine", "  mplicits doctor", lambda _parser: None, _doctor
         ),
         "sample": Command(
             "write the bundled scan of a statue, or the mesh of a solid with sharp edges",
@@ -188,6 +183,6 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
     }
 )
 
-MPLICITS = Program("mplicits", COMMANDS, OVERVIEW, MOVED)
+MPLICITS = Program("mplicits", COMMANDS, OVERVIEW)
 main = MPLICITS.main
 """Run one command of ``mplicits``; see `Program.main`."""

@@ -179,11 +179,7 @@ def _tell_outcome(outcome: FitOutcome) -> None:
 
 
 def _depth_input(arguments: argparse.Namespace, cloud: str) -> DepthInput | None:
-    """What the arguments say of depth maps; None if CLOUD is a cloud.
-
-    Raises:
-        InputError: there are flags of depth maps, but CLOUD is none.
-    """
+    """The depth maps that the arguments name; None if CLOUD is a cloud, which flags of depth maps do not go with."""
     from ...datasets import DepthSettings, is_depth_file
     from ...datasets.files import DEPTH_SUFFIXES
     from ..fit.depth import DepthInput
@@ -232,11 +228,7 @@ Rows = list[tuple[str, str]]
 
 
 def describe(path: str | Path) -> str:
-    """A few lines about ``path``.
-
-    Raises:
-        InputError: it is nothing that we can read.
-    """
+    """A few lines about a run, a field, a mesh or a cloud."""
     from ..surface.surface import read_described
     from ..training.folder import is_field
 

@@ -91,11 +91,7 @@ def _check_state(target: Path, *, resume: bool, force: bool) -> None:
 
 
 def tell_texture(target: Path, fitted: FittedTexture, again: str) -> None:
-    """Print what has been trained, and warn of points that were left out.
-
-    Raises:
-        Stopped: it is not finished; ``again`` says how to continue.
-    """
+    """Print what was trained and how many points were left out; raise `Stopped` with ``again`` if it is unfinished."""
     record, config = fitted.record, fitted.record["config"]
     tell_budget(record, "the texture ")
     if record["left_out"]:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from ..training.settings import given_flags, input_error
-from .common import Command, add_flags, check_output, refuse, stoppable, whole
+from .common import Command, add_flags, check_output, stoppable, whole
 
 PAGES = (".html", ".htm")
 # At the beginning of each page that was written here, so that no other page of a user's is overwritten.
@@ -22,7 +22,6 @@ def _web_arguments(parser: argparse.ArgumentParser) -> None:
     add("--levels", type=whole(1), metavar="N", help="only the N coarsest levels (default: all)")
     add("--no-colors", dest="colors", action="store_false", help="leave out the colours of the run's texture")
     add("--cloud", metavar="FILE", help="show this cloud too, coloured by its distance from the surface")
-    add("--no-highlights", action="store_true", help=argparse.SUPPRESS)
     add("--float32", action="store_true", help="keep the weights as they are (default: 13 bits each)")
     add_flags(parser, "--up")
     add("--title", metavar="TEXT", help="of the page (default: the name of the run)")
@@ -43,7 +42,6 @@ def _check_folder(out: Path) -> None:
 
 
 def _web(arguments: argparse.Namespace) -> int:
-    refuse(arguments, ["no_highlights"], "pages have no colours by direction of view any more; leave the option out")
     out = arguments.out
     if out.suffix:
         check_output(out, PAGES)

@@ -2,12 +2,12 @@
 
     import mplicits
 
-    run = mplicits.fit("scan.ply")  # and reconstruct, evolve and texture, which return a `Run` as well
+    run = mplicits.fit("scan.ply")  # or reconstruct, evolve, texture: each returns a `Run`
     run.mesh().export("scan_mesh.ply")
     shape = mplicits.load("runs/scan")
     shape.distance(points)  # in the scan's coordinates and units
 
-Names are looked up when they are asked for, so that ``import mplicits`` loads neither torch nor numpy.
+Names are imported on first use, so that ``import mplicits`` loads neither torch nor numpy.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ __all__ = [  # noqa: RUF022
 
 
 def load(path: str | Path, *, time: float | None = None, device: Device | str = "cpu") -> WorldField:
-    """What a run answers, in the coordinates of its input.
+    """The field of a run or file, in the coordinates of its input.
 
     Args:
         path: run directory of ``mplicits fit``, ``reconstruct`` or ``evolve``, or a .safetensors file.

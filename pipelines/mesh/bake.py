@@ -25,11 +25,9 @@ Progress = Callable[[str, int, int], None]
 
 
 class Baked(NamedTuple):
-    """Images ``(size, size, 3)`` uint8, first row on top.
+    """Images ``(size, size, 3)`` uint8, first row on top: display colours, and tangent-space normals n; or None.
 
-    Attributes:
-        color: display RGB; None if there are no colours.
-        normal: tangent-space normals n as ``255 (n + 1) / 2``, +y upwards as in glTF and OpenGL; None without normals.
+    Normals are ``255 (n + 1) / 2``, +y upwards as in glTF and OpenGL.
     """
 
     color: Image | None
@@ -45,21 +43,11 @@ def bake(
     progress: Progress | None = None,
     batch: int = 1 << 17,
 ) -> Baked:
-    """Ask for the colour and the normal at the point of the mesh under the centre of every texel.
+    """Colour and normal at the point of an unwrapped mesh under the centre of each of ``size``² texels.
 
-    Texels that no triangle covers get the value of the nearest one that is covered, so that filters and mip maps do
-    not bleed.
-
-    Args:
-        mesh: with texture coordinates.
-        colors_at: ``(N, 3)`` points in the mesh's coordinates → display colours ``(N, 3)`` in [0, 1].
-        normals_at: the same → normals ``(N, 3)``, of any length, outward.
-        size: texels along each side.
-        progress: told "bake", how many triangles are done, and of how many.
-        batch: points per call.
-
-    Raises:
-        ValueError: there is nothing to bake, the mesh is not unwrapped, or no triangle covers a texel.
+    ``colors_at`` returns display colours ``(N, 3)`` in [0, 1], ``normals_at`` outward normals of any length, at points
+    ``(N, 3)`` of the mesh, ``batch`` per call. Texels that no triangle covers get the value of the nearest one that is
+    covered, so that filters do not bleed. Raises a ValueError if there is nothing to bake or no texel is covered.
     """
     if colors_at is None and normals_at is None:
         raise ValueError("colors_at, normals_at: expected at least one")
@@ -103,11 +91,7 @@ def _encoded(coordinates: Float64) -> Image:
 
 
 def check_texture_size(size: int) -> None:
-    """Refuse textures that are tiny, or larger than graphics cards take.
-
-    Raises:
-        InputError: it is one.
-    """
+    """Raise an InputError for textures that are tiny, or larger than graphics cards take."""
     if not 16 <= size <= 16384:
         raise InputError(f"--texture {size}: expected 16 to 16384 texels along each side, 2048 say")
 
@@ -124,24 +108,12 @@ def textured_mesh(
     placement: Placement | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
-    """Decimate, unwrap, bake, and write a textured GLB, or an OBJ with its MTL and PNG files.
+    """Decimate, unwrap, bake, and write a textured GLB, or an OBJ with its MTL and PNG files → the mesh as written.
 
-    Args:
-        path: the .glb or .obj file.
-        mesh: in unit-sphere coordinates.
-        similarity: from there to input coordinates.
-        colors_at: see `bake`; points are in unit-sphere coordinates, on the decimated mesh, near the surface.
-        normals_at: likewise.
-        size: texels along each side.
-        faces: triangles to keep.
-        placement: see `write_mesh`.
-        progress: told the stage ("unwrap", "bake"), how much of it is done, and of how much.
-
-    Returns:
-        The mesh as written, in unit-sphere coordinates.
-
-    Raises:
-        InputError: the file cannot be written, the size is out of range, or ``mplicits[texture]`` is not installed.
+    Mesh and points are in unit-sphere coordinates. ``colors_at`` and ``normals_at`` (see `bake`) get points of the
+    decimated mesh, near the surface. ``size`` is the side of the textures in texels, ``faces`` the triangles to keep.
+    ``progress`` is called with the stage ("unwrap", "bake"), how much of it is done, and of how much. Raises
+    InputError.
     """
     path = check_textured_path(path, similarity)
     check_texture_size(size)

@@ -23,8 +23,8 @@ from ...neural_fields.tracing.projection import map_attribute
 from ..surface.surface import Support, in_region, keep_largest, read_support, seen_part, trim_distance, without_blobs
 from ..texture.transport import Colors, colors_of_run
 from ..training.folder import TEXTURE_FILE, chosen_level, find_field, fitted_cloud, load_still
+from .atlas import Decimation, check_tools, decimated
 from .bake import check_texture_size, textured_mesh
-from .decimation import Decimation, check_decimation_tool, decimated
 from .files import check_mesh_path, check_textured_path, placement_of, write_mesh
 from .printing import PrintReport, print_report
 
@@ -35,12 +35,7 @@ THIN_SHARE = 0.02
 
 
 class Fineness(NamedTuple):
-    """What thin parts ask of a mesh.
-
-    Attributes:
-        resolution: the fewest cells per side, of those tried, that show them.
-        missed: the share of the points that lie on parts too thin for `RESOLUTIONS`[0].
-    """
+    """The fewest cells per side, of those tried, that show thin parts; the share of points missed by the first."""
 
     resolution: int
     missed: float
@@ -49,25 +44,18 @@ class Fineness(NamedTuple):
 def thin_depth(resolution: int) -> float:
     """The thickness √3 h up to which a part is thin for cells of side h, in unit-sphere lengths.
 
-    On each line of corners along the axis nearest to its normal, a plate as thick as one cell has a corner inside; the
-    diagonal leaves room for bars, and for a field's errors. The mesher's box has a side of 2.04.
+    A plate as thick as one cell has a corner inside on each line along the axis nearest to its normal; the diagonal
+    leaves room for bars and errors. The mesher's box has a side of 2.04.
     """
     return 3**0.5 * 2.04 / resolution
 
 
 @torch.no_grad()
 def thin_share(field: Field, points: NDArray[np.floating], resolution: int, *, level: int = -1) -> float:
-    """The share of points on parts that are too thin for so many cells: thinner than √3 of them.
+    """The share of points ``(N, 3)`` on parts thinner than √3 of so many cells.
 
-    Each point is first moved onto the surface by a Newton step, x = p - f n / |∇f| with n = ∇f / |∇f|. It lies on a
-    part of thickness t if x - s n is inside for s < t, and outside beyond. Asked are s = d / 4 and s = d, for d of √3
-    cells; what is outside at both was no point of the surface.
-
-    Args:
-        field: in unit-sphere coordinates, negative inside.
-        points: ``(N, 3)`` near its surface.
-        resolution: cells along each side of the mesher's box.
-        level: whose surface.
+    Each point is moved onto the surface by x = p − f n / |∇f|, n = ∇f / |∇f|. With d of √3 cells, its part is thin if
+    x − n d / 4 is inside and x − n d outside; a point whose x − n d / 4 is outside was not on the surface.
     """
     depth = thin_depth(resolution)
     asked = torch.from_numpy(np.asarray(points[:: 1 + len(points) // 20_000], np.float32))
@@ -81,13 +69,7 @@ def thin_share(field: Field, points: NDArray[np.floating], resolution: int, *, l
 
 
 def fineness(field: Field, points: NDArray[np.floating], *, level: int = -1) -> Fineness:
-    """The resolution at which hardly any points lie on parts too thin for it; the last of `RESOLUTIONS` if none does.
-
-    Args:
-        field: in unit-sphere coordinates, negative inside.
-        points: ``(N, 3)`` near its surface.
-        level: whose surface.
-    """
+    """The resolution at which hardly any points ``(N, 3)`` lie on parts too thin for it; else the last one."""
     missed = thin_share(field, points, RESOLUTIONS[0], level=level)
     if missed <= THIN_SHARE:
         return Fineness(RESOLUTIONS[0], missed)
@@ -106,21 +88,18 @@ class MeshOptions:
             parts too thin for that (see `fineness`).
         time: the moment, for a surface that moves.
         level: counted from 0, the coarsest; None is the finest.
-        normal_level: the level whose gradients are the normals (neural normal mapping); None is ``level``.
+        normal_level: level of the normals (neural normal mapping); None is ``level``.
         colors: whether vertices get the colours of the run's texture, if it has one.
-        texture: unwrap the mesh and bake colours and the normals of the finest level into images of so many texels
-            along each side (.glb or .obj); None leaves the colours at the vertices.
+        texture: bake colours and the finest normals into images of so many texels along each side (.glb or .obj).
         texture_faces: triangles to keep of a mesh that is unwrapped.
         faces: triangles to keep of one that is not; None keeps all.
         report: whether to look at the mesh as a printer would; None does so for STL.
         keep_unsupported: whether to keep components that no input points support.
-        seen: whether to leave out what fewer than two photographs have seen, of a run of ``reconstruct``.
+        seen: whether to leave out what fewer than two photographs have seen, for a run of ``reconstruct``.
         keep_largest: whether to keep only the component of largest area.
         trim_distance: drop faces further than this from the points, in input units.
         cloud: the points for that; by default the file that was fitted.
-        up: the axis that points up in the input, "y" or "z"; see `Placement`, as for the next two.
-        unit: the length of one input unit: "mm", "cm", "m", ….
-        center: whether the middle of the mesh goes to the origin.
+        up: the axis that points up in the input, "y" or "z"; see `Placement`, as for ``unit`` ("mm") and ``center``.
     """
 
     resolution: int | None = None
@@ -143,13 +122,7 @@ class MeshOptions:
 
 
 class Exported(NamedTuple):
-    """A mesh that was written, and what is known of it.
-
-    Attributes:
-        mesh: as written, but in unit-sphere coordinates.
-        decimation: what leaving out triangles has cost, in input units; None where none were left out.
-        printing: what a printer asks; None where it was not asked.
-    """
+    """A written mesh in unit-sphere coordinates, the cost of its decimation in input units, a printer's report."""
 
     mesh: Mesh
     decimation: Decimation | None = None
@@ -178,11 +151,7 @@ def export_run(
         run: run directory or .safetensors file.
         out: the mesh file.
         options: how.
-        say: called with a line about what was removed, if anything was, with one about the coordinates of the file
-            where they are not just those of the input, and with one about triangles left out.
-
-    Returns:
-        The mesh, and what was asked about it.
+        say: called with a line about removed parts, about changed coordinates and about a decimation.
 
     Raises:
         InputError: there is no such run or level, it has no surface, the file cannot be written, or an option does not
@@ -198,7 +167,7 @@ def export_run(
             given = "--faces" if options.faces is not None else "--report"
             raise InputError(f"{given}: goes with a mesh without --texture; --texture-faces says how many it keeps")
     if options.faces is not None:
-        check_decimation_tool()
+        check_tools("--faces", "fast_simplification")
     file = find_field(run)
     field, similarity, metadata = load_still(file, options.time)
     check(out, similarity, centered=placement.center)  # again: not every format can hold every place
@@ -298,18 +267,10 @@ def _evaluated(colors: Colors, points: NDArray[np.float64]) -> NDArray[np.float3
 
 @torch.no_grad()
 def normals_near(field: Field, points: NDArray[np.float64], *, level: int) -> NDArray[np.float32]:
-    """Neural normal mapping: the gradients ``(N, 3)`` of a level at points of a mesh nearby.
+    """Neural normal mapping: the gradients ``(N, 3)`` of a level at points of a mesh nearby; zero far from any surface.
 
-    A level above the coarsest differs from those before it only in their bands, which a coarse mesh, or one that has
-    been decimated, may leave. Its points there take the gradient at the surface point nearest to them.
-
-    Args:
-        field: on the CPU.
-        points: ``(N, 3)``, in unit-sphere coordinates.
-        level: counted from 0.
-
-    Returns:
-        The gradients; zero where no surface was found.
+    Finer levels differ from coarser ones only in their bands, which a coarse or decimated mesh may leave. Its points
+    there take the gradient at the nearest point of the surface.
     """
     # Outside the band of a level i all finer ones are f_i, and |f_i| ≥ δ_i: so |f| below every δ is inside all bands.
     delta = float(field.deltas[:level].min()) if level else math.inf

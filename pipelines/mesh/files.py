@@ -1,8 +1,4 @@
-"""Meshes out, in input coordinates, complete or not at all: PLY, OBJ, STL and GLB; with textures; and moving, as GLB.
-
-`write_mesh` has colours at the vertices, `write_textured` in images (in a GLB, or beside an OBJ with its MTL), and
-`write_moving` a mesh whose vertices move. The formats themselves are in ``neural_fields/meshing/mesh.py``.
-"""
+"""Meshes out, in input coordinates, complete or not at all: PLY, OBJ, STL and GLB; textured; and moving GLB."""
 
 from __future__ import annotations
 
@@ -27,17 +23,13 @@ from ...neural_fields.meshing.mesh import (
     write_triangles,
 )
 from ...neural_fields.meshing.placement import Placement
-from .atlas import check_unwrap_tools
+from .atlas import check_tools
 
 Image = NDArray[np.uint8]
 
 
 def placement_of(up: str | None, unit: str | None, center: bool) -> Placement:
-    """What flags say of the input's coordinates; see `Placement`.
-
-    Raises:
-        InputError: there is no such axis or unit.
-    """
+    """The `Placement` that flags describe; raises InputError."""
     try:
         return Placement(up, unit, center)
     except ValueError as error:
@@ -45,20 +37,11 @@ def placement_of(up: str | None, unit: str | None, center: bool) -> Placement:
 
 
 def check_textured_path(path: str | Path, similarity: Similarity | None = None, *, centered: bool = False) -> Path:
-    """Whether a textured mesh can be made and written to ``path``, to be asked before any long work.
-
-    Args:
-        path: see `check_mesh_path`.
-        similarity: likewise.
-        centered: likewise.
-
-    Raises:
-        InputError: the format holds no texture, the place may not be written, or ``mplicits[texture]`` is missing.
-    """
+    """Raise an InputError before any long work if a textured mesh cannot be made or written; see `check_mesh_path`."""
     path = Path(path)
     if path.suffix.lower() not in (".glb", ".obj"):
         raise InputError(f"{path}: textures are written as .glb or .obj; choose one of them, or leave --texture out")
-    check_unwrap_tools()
+    check_tools("--texture", "fast_simplification", "xatlas")
     return check_mesh_path(path, similarity, centered=centered)
 
 
@@ -67,10 +50,10 @@ def write_mesh(
 ) -> None:
     """Write ``mesh``, moved to input coordinates by ``similarity``; the extension chooses the format.
 
-    PLY is binary, with double coordinates where float would spoil them (see `needs_doubles`), normals and
-    colours; OBJ has normals and colours; STL (binary) neither. Colours are display numbers in PLY and OBJ, linear
-    light in GLB. GLB is float32 by its standard: far from the origin it holds coordinates relative to
-    ``similarity.center``, which the node's ``extras`` keep. The file appears under its name only when it is complete.
+    PLY is binary, with double coordinates where float would spoil them, normals and colours; OBJ has normals and
+    colours; STL (binary) neither. Colours are display numbers in PLY and OBJ, linear light in GLB. GLB is float32: far
+    from the origin its coordinates are relative to ``similarity.center``, which the node's ``extras`` keep. The file
+    appears under its name only when it is complete.
 
     Args:
         path: the file.
@@ -98,20 +81,10 @@ def write_moving(
     colors: NDArray[np.floating] | None = None,
     placement: Placement | None = None,
 ) -> None:
-    """Write a GLB of one mesh whose vertices move: morph targets, one for each frame after the first, and an animation.
+    """Write a GLB of one mesh whose vertices move: a morph target for each frame after the first, and an animation.
 
-    Args:
-        path: the .glb file; it appears under its name only when it is complete.
-        faces: ``(F, 3)``, the same in all frames.
-        vertices: ``(V, 3)`` in each of the T frames, in unit-sphere coordinates; in between they are interpolated.
-        normals: ``(V, 3)`` likewise.
-        seconds: ``(T,)`` when the frames are, increasing from 0.
-        similarity: from input to unit-sphere coordinates.
-        colors: ``(V, 3)`` display RGB in [0, 1], which stay.
-        placement: see `write_mesh`; the first frame is what is centred.
-
-    Raises:
-        InputError: the disk is full.
+    ``vertices`` and ``normals`` ``(V, 3)`` of each frame are in unit-sphere coordinates, ``seconds`` ``(T,)`` increase
+    from 0, and ``colors`` ``(V, 3)`` stay. The first frame is what ``placement`` centres. Raises an InputError.
     """
     placement = placement or Placement()
     frames = [Mesh(similarity.to_input(rows), faces, across) for rows, across in zip(vertices, normals, strict=True)]
@@ -132,22 +105,10 @@ def write_textured(
     normal: Image | None,
     placement: Placement | None = None,
 ) -> None:
-    """Write ``mesh``, moved to input coordinates by ``similarity``, with its images.
+    """Write an unwrapped mesh with images ``(H, W, 3)``: display colours, and tangent-space normals, +y upwards.
 
     ``shape.glb`` is one file, with tangents. Beside ``shape.obj`` there are ``shape.mtl``, ``shape_color.png`` and
-    ``shape_normal.png``. The files appear under their names only when all of them are complete.
-
-    Args:
-        path: the .glb or .obj file.
-        mesh: with texture coordinates, in unit-sphere coordinates.
-        similarity: from input to unit-sphere coordinates. Far from the origin, positions in a GLB are relative to its
-            centre; see `write_mesh`.
-        color: ``(H, W, 3)`` display RGB, or None.
-        normal: ``(H, W, 3)`` tangent-space normals, +y upwards, or None.
-        placement: see `write_mesh`.
-
-    Raises:
-        InputError: see `check_textured_path`; or the disk is full.
+    ``shape_normal.png``. They appear under their names when all are complete. Raises an InputError.
     """
     path, placement = check_textured_path(path, similarity), placement or Placement()
     images = {name: _png(image) for name, image in (("color", color), ("normal", normal)) if image is not None}

@@ -28,12 +28,10 @@ class FitMesh:
     """The mesh that a fit shall end with.
 
     Attributes:
-        out: the mesh file.
-        run: directory of the run.
         source: what holds the colours, a cloud or a mesh in the coordinates of the fit.
         colored: whether there are colours, and they are wanted.
-        columns: of that cloud; see `read_cloud`.
         trim: whether what the fit closes behind a depth map is cut off.
+        columns: of that cloud; see `read_cloud`.
     """
 
     out: Path
@@ -44,18 +42,9 @@ class FitMesh:
     columns: str | None = None
 
     def texture(self, *, refit: bool, progress: Callable[[Progress], None] | None = None) -> FittedTexture | None:
-        """Train the texture with the default settings, on the device and with the seed of the fit.
+        """Train the texture with default settings; None if there are no colours, or it was trained before.
 
-        Args:
-            refit: whether the field is new; a texture of it that is there already is kept otherwise, and one whose
-                training was interrupted is trained to its end.
-            progress: see `fit_texture`.
-
-        Returns:
-            The texture; None if there are no colours, or it was trained before.
-
-        Raises:
-            InputError: see `texture_run`.
+        ``refit``: the field is new; otherwise a texture that is there is kept, and an interrupted one continued.
         """
         texture = self.run / TEXTURE_FILE
         resume = not refit and texture_state_file(texture).is_file()
@@ -70,15 +59,7 @@ class FitMesh:
     def extract(
         self, say: Callable[[str], None] | None = None, *, progress: Callable[[Progress], None] | None = None
     ) -> Mesh:
-        """Extract and write the mesh, as `mesh_run` does by default, trimmed where it shall be.
-
-        Args:
-            say: see `mesh_run`.
-            progress: told when it begins and ends.
-
-        Raises:
-            InputError: see `mesh_run`.
-        """
+        """Extract and write the mesh, as `mesh_run` does by default, trimmed where it shall be."""
         trim = trim_suggestion(self.run) if self.trim else None
         options = MeshOptions(colors=self.colored, trim_distance=trim, cloud=self.source if self.trim else None)
         with reported(progress, "mesh"):
@@ -88,18 +69,9 @@ class FitMesh:
 def plan_mesh(
     out: Path, run: Path, source: Path | DepthInput, *, colors: bool, resume: bool, columns: str | None = None
 ) -> FitMesh:
-    """Check, before the fit, all that its mesh will need.
+    """Check, before the fit, all that its mesh will need; depth maps are not read again to ``resume``.
 
-    Args:
-        out: the mesh file; it may lie in the run's directory.
-        run: directory of the run.
-        source: what is fitted.
-        colors: whether colours are wanted.
-        resume: whether the run was begun before; depth maps are then not read again.
-        columns: of the cloud; see `read_cloud`.
-
-    Raises:
-        InputError: ``out`` cannot be written or is the cloud itself, or the cloud or its texture cannot be read.
+    Raises an InputError if ``out`` cannot be written or is the cloud itself, or the cloud's texture cannot be read.
     """
     depth = isinstance(source, DepthInput)
     cloud = run / CLOUD_FILE if depth else source

@@ -19,11 +19,9 @@ Float64 = NDArray[np.float64]
 
 
 class Thickness(NamedTuple):
-    """How thick a shape is at points of its surface.
+    """Thickness ``(N,)`` in units of the field, and the points ``(N, 3)`` on the surface where the rays begin.
 
-    Attributes:
-        depth: ``(N,)`` in units of the field; infinite where a ray does not come out, NaN where no surface was found.
-        points: ``(N, 3)`` on the surface, where the rays begin.
+    A depth is infinite where a ray does not come out, NaN where no surface was found.
     """
 
     depth: Float64
@@ -34,17 +32,10 @@ class Thickness(NamedTuple):
 def thickness(
     field: Field, points: Float64, *, level: int = -1, first: float = 1e-3, least: float = 4e-3, farthest: float = 2.1
 ) -> Thickness:
-    """The length of the way from points of a surface inward along the normal to the other side.
+    """The length of the way from points ``(N, 3)`` near a surface inward along the normal to the other side.
 
-    Exact where the other side is opposite, as in slabs, tubes and balls; elsewhere more than the largest ball would be.
-
-    Args:
-        field: negative inside.
-        points: ``(N, 3)`` near its surface, in its coordinates.
-        level: the level whose surface it is.
-        first: the first step under the surface, in unit-sphere lengths.
-        least: the least step after that.
-        farthest: length of way after which a ray has left the unit sphere.
+    Exact in slabs, tubes and balls; elsewhere more than the largest ball would be. ``first`` is the first step under
+    the surface and ``least`` the least one after it; beyond ``farthest`` a ray has left the unit sphere.
     """
     feet, reached = project_to_surface(field, torch.from_numpy(points).to(field.like), level=level)
     inward = -torch.nn.functional.normalize(field.jet(feet, level=level).gradient, dim=-1)
@@ -72,18 +63,13 @@ def thickness(
 
 @dataclass(frozen=True)
 class PrintReport:
-    """A mesh as its file has it: in the coordinates and the unit of the file.
+    """A mesh in the coordinates and the ``unit`` of its file ("input units" where that is not known).
 
     Attributes:
-        unit: of all lengths; "input units" where it is not known.
-        watertight: whether every edge has two faces.
         consistent: whether neighbouring faces agree on what is outside.
         parts: connected components, hollows among them.
-        size: of the bounding box, ``(3,)``.
         volume: inside, hollows subtracted; meaningful for a watertight mesh.
-        area: of all faces.
-        thinnest: least thickness found, straight through; None where nothing was found.
-        thinnest_at: where, ``(3,)``.
+        thinnest: least thickness found, straight through, at ``thinnest_at`` ``(3,)``; None where nothing was found.
         thin: 1 % of the surface is no thicker than this.
     """
 
@@ -109,19 +95,10 @@ def print_report(
     level: int = -1,
     samples: int = 5_000,
 ) -> PrintReport:
-    """Measure a mesh for printing.
+    """Measure a mesh, in unit-sphere coordinates, for printing from a file of type ``suffix``.
 
-    Args:
-        mesh: in unit-sphere coordinates.
-        field: whose surface it is; on the CPU.
-        similarity: from input to unit-sphere coordinates.
-        placement: how the file is placed.
-        suffix: of the file.
-        level: of the field.
-        samples: points at which the thickness is measured, uniform by area; seed 0.
-
-    Raises:
-        ValueError: the mesh has no faces.
+    The thickness of ``field``, on the CPU, is measured at ``samples`` points, uniform by area, seed 0. Raises a
+    ValueError for a mesh without faces.
     """
     if not len(mesh.faces):
         raise ValueError("mesh: has no faces to report on")

@@ -30,7 +30,7 @@ from ...neural_fields.fields.csg import Bounded
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from ...neural_fields.meshing.placement import METRES
 from ...neural_fields.shape import in_one_frame
-from ..surface.solid import MeshField
+from ..surface.distance import MeshField
 from ..surface.surface import Support, is_closed, read_support, read_surface, volume, without_blobs
 from ..training.folder import chosen_level, find_field, is_field, load_still
 from .files import check_mesh_path, placement_of, write_mesh
@@ -55,11 +55,10 @@ class SolidOptions:
     Attributes:
         resolution: cells along each side of the cube around all operands.
         time: the moment, for operands that move.
-        level: counted from 0, the coarsest; None is the finest. Operands with fewer levels stay at their finest.
+        level: from 0, the coarsest; None is the finest. Operands with fewer levels stay at their finest.
         keep_unsupported: whether to keep components that no input points of the runs support.
-        up: see `Placement`, as for the next two.
-        unit: the length of one input unit, which lengths with a unit are measured in.
-        center: whether the middle of the mesh goes to the origin.
+        up: see `Placement`, as for ``center``.
+        unit: the length of one input unit, by which lengths with a unit are measured.
     """
 
     resolution: int = 256
@@ -73,13 +72,7 @@ class SolidOptions:
 
 @dataclass(frozen=True)
 class Made:
-    """What was made.
-
-    Attributes:
-        mesh: in input coordinates.
-        closed: whether it is watertight.
-        volume: what it encloses, in cubic input units.
-    """
+    """A mesh in input coordinates, whether it is watertight, and its volume in cubic input units."""
 
     mesh: Mesh
     closed: bool
@@ -88,13 +81,7 @@ class Made:
 
 @dataclass(frozen=True)
 class Operand:
-    """A fit or a mesh.
-
-    Attributes:
-        name: what the user called it.
-        shape: its field, and where it is.
-        support: the points that a run rests on, in the coordinates of its field; None where all of it is trusted.
-    """
+    """A fit or a mesh: name, field and frame, and the points that a run rests on (None: all of it is trusted)."""
 
     name: str
     shape: WorldField
@@ -102,15 +89,9 @@ class Operand:
 
 
 def length_in(text: str, unit: str | None, flag: str) -> float:
-    """A length in input units.
+    """A length in input units, from a number of them, or a number and a unit: "2mm"; ``flag`` is for messages.
 
-    Args:
-        text: a number of input units, or a number and a unit: "2mm".
-        unit: the length of one input unit, a key of `METRES`, if it is known.
-        flag: what messages call the length.
-
-    Raises:
-        InputError: it is no length, or the length of an input unit would have to be known.
+    ``unit`` is the length of one input unit, a key of `METRES`, if it is known. Raises InputError.
 
     Example:
         >>> length_in("2mm", "cm", "--by"), length_in("-0.5", None, "--by")
@@ -137,21 +118,12 @@ def boolean(
     smooth: str = "0",
     say: Callable[[str], None] | None = None,
 ) -> Made:
-    """Join runs, checkpoints and closed meshes that lie in the same input coordinates.
+    """Join two or more runs, checkpoints and closed meshes that lie in the same input coordinates.
 
-    Args:
-        parts: two or more; of a difference the others are taken from the first.
-        operation: a key of `OPERATIONS`.
-        out: a mesh file; or a .safetensors file for the field itself, where no part is a mesh.
-        options: how.
-        smooth: width of the blend, see `length_in` and `Union`.
-        say: called with a line about what was removed, if anything was.
-
-    Returns:
-        The mesh, also where the field was written.
-
-    Raises:
-        InputError: a part cannot be read or is not closed, nothing is left, or the file cannot be written.
+    ``operation`` is a key of `OPERATIONS`; a difference takes the others from the first. ``out`` is a mesh, or a
+    .safetensors file for the field itself, where no part is a mesh. ``smooth`` is the width of the blend (`length_in`,
+    `Union`). ``say`` is called with a line about what was removed. Raises an InputError if a part cannot be read or is
+    not closed, nothing is left, or the file cannot be written.
     """
     options = options or SolidOptions()
     width = length_in(smooth, options.unit, "--smooth")
@@ -189,22 +161,11 @@ def offset(
     shell: bool = False,
     say: Callable[[str], None] | None = None,
 ) -> Made:
-    """Grow or shrink a run or a closed mesh by a length, or keep the wall between it and that.
+    """Grow or shrink a run or a closed mesh by a length (`length_in`), or keep the wall in between, if ``shell``.
 
-    The distance is that to the mesh of the finest level, not what the field says so far from its surface: a
-    `MultiscaleSDF` is its coarsest level there.
-
-    Args:
-        part: a run, a checkpoint or a closed mesh.
-        by: how far, outwards; negative is inwards. See `length_in`.
-        out: the mesh file.
-        options: how.
-        shell: whether to keep only what lies between the surface and where it went.
-        say: called with a line about what was removed, if anything was.
-
-    Raises:
-        InputError: the part cannot be read or is not closed, nothing is left, a wall is thinner than two cells, or the
-            file cannot be written.
+    The distance is that to the mesh of the finest level: away from its surface, a `MultiscaleSDF` is its coarsest
+    level. ``say`` is called with a line about what was removed. Raises an InputError if the part cannot be read or is
+    not closed, nothing is left, a wall is thinner than two cells, or the file cannot be written.
     """
     options = options or SolidOptions()
     length = length_in(by, options.unit, "--by")

@@ -39,13 +39,7 @@ FRAME_RESOLUTION = 128  # of the mesh that says what the camera has to look at
 
 @dataclass(frozen=True)
 class Panel:
-    """One of the pictures that stand side by side.
-
-    Attributes:
-        label: over it.
-        level: whose surface is seen.
-        normal_level: whose normals.
-    """
+    """One of the pictures side by side: its title, the level that is visible, and the level of the normals."""
 
     label: str
     level: int = 0
@@ -54,16 +48,14 @@ class Panel:
 
 @dataclass(frozen=True)
 class Subject:
-    """Something to draw, in unit-sphere coordinates.
+    """What is drawn, in unit-sphere coordinates.
 
     Attributes:
-        name: of the file, for messages.
         similarity: from input coordinates to those.
-        panels: what to draw of it, at least one.
         field: what is traced; None for a mesh or a cloud.
         colored: whether it has colours of its own.
         oriented: whether it has normals.
-        fitted_to: finds the cloud that the field was fitted to, or raises an InputError; None for a mesh or a cloud.
+        fitted_to: finds the fitted cloud, or raises an InputError; None for a mesh or a cloud.
         outline: points ``(N, 3)`` that a camera has to have in view.
         view: what the pixels of a camera see.
     """
@@ -88,18 +80,9 @@ def open_subject(
     levels: bool = False,
     device: torch.device | str = "cpu",
 ) -> Subject:
-    """Open a run, a .safetensors file, a mesh or a cloud.
+    """Open a run, a .safetensors file, a mesh or a cloud; see `RenderOptions` for the arguments.
 
-    Args:
-        source: which.
-        time: the moment, of a run that moves.
-        level: to draw; by default the finest.
-        normal_level: whose normals; by default ``level``.
-        levels: whether to draw all levels side by side, and the coarsest with the normals of the finest.
-        device: where to evaluate a field.
-
-    Raises:
-        InputError: it cannot be read, or there is no such level.
+    Raises an InputError if it cannot be read or there is no such level.
     """
     if is_field(source):
         return _field_subject(find_field(source), time, level, normal_level, levels, device)
@@ -133,22 +116,9 @@ def _field_subject(
 
 
 def subject_of(
-    field: Field,
-    similarity: Similarity,
-    *,
-    name: Path,
-    panels: Sequence[Panel],
-    colors: Colors | None = None,
+    field: Field, similarity: Similarity, *, name: Path, panels: Sequence[Panel], colors: Colors | None = None
 ) -> Subject:
-    """A field to draw.
-
-    Args:
-        field: three-dimensional, on the device where it shall be evaluated.
-        similarity: from input coordinates to those of the field.
-        name: for messages.
-        panels: what to draw of it.
-        colors: of points of its surface, if it has some.
-    """
+    """A three-dimensional field to draw, evaluated on its own device; ``name`` is for messages."""
     device = field.like.device
 
     def view(camera: Camera, panel: Panel) -> Seen:
@@ -184,10 +154,7 @@ def _outline(file: Path, field: Field) -> Float64:
 
 
 def traced_part(points: Float64) -> Float64:
-    """Those of the points ``(N, 3)`` of a mesh that rays reach, or all if none are.
-
-    An open surface may go on to the corners of the mesher's cube, but is not traced there.
-    """
+    """The points ``(N, 3)`` of a mesh inside the ball in which rays are traced; all if none are."""
     inside = np.linalg.norm(points, axis=1) <= BOUNDING_RADIUS
     return points[inside] if inside.any() else points
 
@@ -230,17 +197,10 @@ def disc_size(points: NDArray[np.floating]) -> float:
 
 
 def reference_distance(subject: Subject, reference: str | Path | None) -> Callable[[Tensor], Tensor]:
-    """What measures how far points ``(P, 3)`` are from a reference, ``(P,)``, in the coordinates of the subject.
+    """A function from points ``(P, 3)`` to their distances ``(P,)`` from a cloud or mesh, in the subject's coordinates.
 
-    Where the reference has normals, its points stand for discs that fill the gaps between them (`CloudDistance`), and
-    a surface through them has no error; the distance to bare points is never less than their spacing allows.
-
-    Args:
-        subject: what is drawn.
-        reference: a cloud, or a mesh, of which points are sampled; by default what the field was fitted to.
-
-    Raises:
-        InputError: there is none, or it cannot be read.
+    Without a reference, it is the fitted cloud. Points with normals stand for discs (`CloudDistance`), so a surface
+    through them has no error; the distance to bare points is never below their spacing. Raises InputError.
     """
     if reference is None:
         if subject.fitted_to is None:
@@ -277,28 +237,17 @@ class Orbit:
 
 
 def orbit_cameras(outline: Float64, orbit: Orbit, *, size: tuple[int, int], frames: int) -> list[Camera]:
-    """Cameras once around the points ``outline`` ``(N, 3)``, all at one distance.
-
-    Raises:
-        ValueError: an argument is out of its range, or all points are the same.
-    """
+    """Cameras once around the points ``(N, 3)``, all at one distance."""
     return turntable(outline, frames, width=size[0], height=size[1], **vars(orbit))
 
 
 def posed_cameras(
     file: str | Path, frame: str | None, similarity: Similarity, *, width: int | None, film: bool
 ) -> list[Camera]:
-    """The cameras of a file, in unit-sphere coordinates.
+    """The cameras of a transforms.json or cameras_sphere.npz, in unit-sphere coordinates, for a ``width`` in pixels.
 
-    Args:
-        file: transforms.json or cameras_sphere.npz.
-        frame: which camera, see `choose_frame`; for a film None, which means all of them.
-        similarity: from the file's coordinates, which are those of the input.
-        width: of the pictures, in pixels; the height follows. By default that of the images.
-        film: whether a film is made.
-
-    Raises:
-        InputError: the file cannot be read, has no such frame, or its images are not of one size.
+    A film takes all cameras, a picture the one that ``frame`` names. Raises an InputError if the file cannot be read,
+    has no such frame, or its images differ in size.
     """
     named = read_cameras(file)
     if film and frame is not None:
@@ -313,11 +262,7 @@ def posed_cameras(
 
 
 def choose_frame(file: str | Path, named: Sequence[tuple[str, Camera]], frame: str | None) -> tuple[str, Camera]:
-    """One of the cameras: by name, with or without folder and extension, or by index from 0; the only one by None.
-
-    Raises:
-        InputError: there is none of that name, or there are several.
-    """
+    """One camera by name (with or without folder and extension) or index from 0; the only one for None."""
     names = [name for name, _ in named]
     some = f"has {len(names)} cameras, {names[0]} to {names[-1]}"
     if frame is None:
@@ -356,27 +301,22 @@ class RenderOptions:
     """What is drawn, and how. Lengths and places are the input's.
 
     Attributes:
-        size: width and height; of posed cameras only the width, the height follows. None is (640, 640), or that of
-            the posed images.
-        time: the moment, of a run that moves.
+        size: width and height; the width alone for posed cameras. None is (640, 640), or that of the posed images.
+        time: the moment, for a run that moves.
         level: of a field; None is the finest.
-        normal_level: whose normals (neural normal mapping); None is ``level``.
+        normal_level: the level of the normals (neural normal mapping); None is ``level``.
         levels: all levels side by side, and the coarsest with the normals of the finest.
-        sides: from so many directions side by side, evenly around the up axis from the orbit's azimuth on; each level
-            then has a row of its own. Not of a film, nor from posed cameras.
+        sides: number of directions side by side, evenly around the up axis; not for films or posed cameras.
         shading: one of `SHADINGS`; None is "lambert", or what a cloud without normals can show.
-        shade: settings of the shading; ``limits`` in input units (curvature: in their inverse). Of a mesh or a cloud,
-            shadows and occlusion are left out, as they are traced in a field.
+        shade: settings of the shading; ``limits`` in input units (curvature: their inverse). Meshes and clouds have no
+            shadows or occlusion.
         reference: cloud or mesh for the "error"; None is what the field was fitted to.
-        orbit: where the camera stands.
-        cameras: file of posed cameras instead, in input coordinates.
-        frame: which of them, by name or index; of a film None, all.
+        cameras: file of posed cameras, in place of ``orbit``, in input coordinates.
+        frame: which of them, by name or index; None takes all for a film.
         background: display RGB in [0, 1]; None is transparent.
         legend: whether a picture in a colour map's colours has a legend under it.
         samples: per pixel and direction.
         frames: of a turntable.
-        fps: of a film.
-        device: where to evaluate a field, "auto" is CUDA where there is one.
     """
 
     size: tuple[int, ...] | None = None
@@ -407,22 +347,11 @@ def render_run(
     painter: Painter | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> str:
-    """Draw a run, a mesh or a cloud.
+    """Draw a run, a mesh or a cloud; a film goes once around the shape, or through the posed cameras in order.
 
-    A film goes once around the shape, or through the posed cameras in their order.
-
-    Args:
-        source: run directory, .safetensors file, mesh or cloud.
-        out: a .png or .jpg picture, or an .mp4 or .gif film.
-        options: what, and how.
-        painter: draws in place of the shadings, background included; the subject then says where to look from.
-        progress: called with how many parts are drawn, and of how many.
-
-    Returns:
-        What was drawn, in a few words.
-
-    Raises:
-        InputError: something cannot be read, is not there, or does not go together; or ``out`` cannot be written.
+    ``painter`` draws in place of the shadings, background included; ``progress`` is called with the number of parts
+    drawn, and their total. Returns what was drawn, in a few words. Raises an InputError if something cannot be read or
+    does not go together, or ``out`` cannot be written.
     """
     options, out = options or RenderOptions(), Path(out)
     film = out.suffix.lower() in ANIMATIONS
@@ -460,12 +389,7 @@ def render_shape(
     azimuth: float = 30.0,
     elevation: float = 15.0,
 ) -> Image:
-    """Draw a field that need not be in any file; see `WorldField.render`.
-
-    Raises:
-        InputError: there is no surface, or the file cannot be written.
-        ValueError: there is no such level.
-    """
+    """Draw a field that need not be in a file; see `WorldField.render`."""
     if path is not None:
         check_picture_path(path)
     level = shape.field.resolve_level(level)
@@ -497,11 +421,7 @@ class _Artist:
     """Draws a subject in one manner, with one scale of colours for all pictures."""
 
     def __init__(self, subject: Subject, options: RenderOptions, painter: Painter | None = None) -> None:
-        """Check that the subject can be drawn so, and read what that needs.
-
-        Raises:
-            InputError: it cannot.
-        """
+        """Check that the subject can be drawn so, and read what that needs; raises InputError."""
         self.subject, self.options, self.painter = subject, options, painter
         self.shading = options.shading or default_shading(oriented=subject.oriented, colored=subject.colored)
         # Normals do not show in depths and errors: another level's would only repeat a picture.

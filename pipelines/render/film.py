@@ -25,22 +25,12 @@ BT709 = ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt7
 def write_animation(
     path: str | Path, frames: Iterable[Image], *, fps: float = 30, progress: Callable[[int], None] | None = None
 ) -> None:
-    """Write an H.264 MP4 that every player takes, or a GIF that loops.
+    """Write RGB frames ``(H, W, 3)``, uint8, to an H.264 MP4, or a GIF that loops with one palette for all frames.
 
-    Frames are asked for one by one and written into a temporary file beside the target, which takes its place only
-    when it is whole: an interruption leaves an older file as it was. An odd width or height of an MP4 is padded by
-    repeating the last column or row, since its colour is stored at half resolution. A GIF gets one palette for
-    all of its frames, so that what rests does not flicker.
-
-    Args:
-        path: an .mp4 or .gif file.
-        frames: ``(H, W, 3)`` uint8 RGB, all of one size.
-        fps: frames per second. A GIF counts in hundredths of a second and shows at most 50.
-        progress: called with the number of frames so far after each one.
-
-    Raises:
-        InputError: another extension, or the file cannot be written.
-        ValueError: there are no frames, one is no RGB image or of another size than the first, or ``fps`` is not > 0.
+    Frames are taken one by one, and the file appears when it is complete. An odd width or height of an MP4 is padded by
+    repeating the last column or row, since colour is stored at half resolution. A GIF shows at most 50 frames per
+    second. ``progress`` is called with the number of frames so far. Raises an InputError if the file cannot be written,
+    and a ValueError for no frames, frames of several sizes, or ``fps`` ≤ 0.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -84,9 +74,9 @@ def _write_mp4(path: Path, frames: Iterator[Image], fps: float) -> None:
 
 
 def _write_gif(path: Path, frames: Iterator[Image], fps: float) -> None:
-    """Two passes over a lossless copy: the best 256 colours of all frames, then the frames in these colours.
+    """Two passes over a lossless copy: the best 256 colours of all frames, then the frames in these.
 
-    Ordered dithering, unlike error diffusion, gives a resting pixel the same colour in every frame.
+    Ordered dithering gives a resting pixel the same colour in every frame; error diffusion does not.
     """
     with tempfile.TemporaryDirectory() as folder:
         clip, palette = Path(folder) / "clip.mkv", Path(folder) / "palette.png"
@@ -109,12 +99,9 @@ def _encode(frames: Iterator[Image], fps: float, output: Sequence[str | Path]) -
 
 @contextmanager
 def _ffmpeg(arguments: Sequence[str | Path]) -> Iterator[IO[bytes]]:
-    """Run ffmpeg around a block that may write to its input; an error in the block kills it.
+    """Run ffmpeg around a block that writes to its input; kill it if the block fails; raise an OSError if ffmpeg fails.
 
-    imageio's own writer leaves ffmpeg running when a frame cannot be made, and does not look at its exit code.
-
-    Raises:
-        OSError: ffmpeg failed; the message gives its reason.
+    imageio's own writer leaves ffmpeg running when a frame cannot be made, and ignores its exit code.
     """
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *map(str, arguments)]
     with tempfile.TemporaryFile() as log:

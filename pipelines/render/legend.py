@@ -27,17 +27,7 @@ def text_width(words: str, size: int) -> int:
 
 
 def text_mask(shape: tuple[int, int], words: str, place: tuple[int, int], size: int) -> NDArray[np.float32]:
-    """How much of each pixel words cover.
-
-    Args:
-        shape: rows and columns of the picture.
-        words: one line.
-        place: column and row of the middle of their left side.
-        size: see `text_width`.
-
-    Returns:
-        ``(rows, columns)`` in [0, 1].
-    """
+    """Coverage ``(rows, columns)`` in [0, 1] of one line of words; ``place`` is the middle of their left side."""
     mask = np.zeros((*shape, 3), np.uint8)
     base = (place[0], place[1] + round(0.36 * size))
     white = (255, 255, 255)
@@ -82,12 +72,8 @@ def with_color_bar(
 ) -> Image:
     """The picture with a strip under it: a title, the bar, and round numbers.
 
-    Args:
-        picture: ``(H, W, 3 | 4)``.
-        colors: ``(K, 3)`` of the map in [0, 1], from the lower limit to the upper one.
-        limits: the values at both ends, as they are to be shown.
-        title: what the numbers are.
-        background: of the strip, in [0, 1]; None is transparent, for a picture with an alpha channel.
+    ``colors`` ``(K, 3)`` in [0, 1] run from the lower to the upper one of ``limits``, which are numbers as shown. A
+    ``background`` of None is transparent.
     """
     height, width = picture.shape[:2]
     text = round(float(np.clip(min(width, 2 * height) / 48, 9, 64)))
@@ -139,15 +125,9 @@ class _Entry:
 def with_legend(
     picture: Image, taken: Slice, *, caption: str, iso_step: float, unit: float = 1.0, bands: bool = True
 ) -> Image:
-    """The picture with a strip under it.
+    """The picture of `draw_slice` with a strip under it that explains lines, colours and scale.
 
-    Args:
-        picture: what `draw_slice` drew.
-        taken: the values it was drawn from.
-        caption: which plane this is.
-        iso_step: distance between iso-lines, in the field's units.
-        unit: what one unit of the field is in the units of the input; all numbers are shown in those.
-        bands: whether the bands were drawn.
+    ``caption`` names the plane. ``iso_step`` is in the field's units, of which one is ``unit`` input units, as shown.
     """
     width = picture.shape[1]
     text = round(float(np.clip(width / 48, 9, 40)))

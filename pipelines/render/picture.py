@@ -1,7 +1,4 @@
-"""Pictures as arrays and as files: rounded to bytes, laid out as sheets with titles, written whole or not at all.
-
-A picture is ``(H, W, 3)`` uint8 RGB, first row on top, or ``(H, W, 4)`` with an alpha channel.
-"""
+"""Pictures as arrays and files: ``(H, W, 3)`` uint8 RGB, first row on top, or ``(H, W, 4)`` with an alpha channel."""
 
 from __future__ import annotations
 
@@ -26,15 +23,9 @@ def as_bytes(colors: NDArray[np.floating]) -> Image:
 
 
 def contact_sheet(*rows: Sequence[Titled], gap: int = 12, strip: int = 40) -> Image:
-    """Rows of pictures, each one's title above it; shorter rows are filled up with white.
+    """Rows of titled pictures, each row of one height; shorter rows are filled up with white.
 
-    Args:
-        rows: titles and pictures ``(H, W, 3)``; within a row of one height.
-        gap: between pictures, in pixels.
-        strip: height of the strip that holds the titles, in pixels.
-
-    Raises:
-        ValueError: there are no pictures, or in one row their heights differ.
+    ``gap`` and ``strip`` are the space between pictures and the height of titles, in pixels.
     """
     return stacked([_row(pictures, gap, strip) for pictures in rows])
 
@@ -70,16 +61,7 @@ def _row(pictures: Sequence[Titled], gap: int, strip: int) -> Image:
 
 
 def check_picture_path(path: str | Path, *, transparent: bool = False) -> None:
-    """Check, before any work is done, that `write_picture` will be able to write there.
-
-    Args:
-        path: of the picture.
-        transparent: whether it has an alpha channel.
-
-    Raises:
-        InputError: the extension is not one of ours or holds no transparency, or the file cannot come to be there
-            (`check_place`).
-    """
+    """Raise an InputError before any work if `write_picture` could not write a picture there."""
     path = Path(path)
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(f"{path}: pictures are written as .png or .jpg")
@@ -94,11 +76,7 @@ def picture_bytes(image: Image, suffix: str = ".png") -> bytes:
 
 
 def write_picture(path: str | Path, image: Image) -> None:
-    """Write a PNG ``(H, W, 3 | 4)`` or a JPEG ``(H, W, 3)``, whole or not at all.
-
-    Raises:
-        InputError: as for `check_picture_path`, or the file cannot be written.
-    """
+    """Write a PNG ``(H, W, 3 | 4)`` or a JPEG ``(H, W, 3)``, whole or not at all; raises InputError."""
     path = Path(path)
     check_picture_path(path, transparent=image.shape[2] == 4)
     write_whole(path, picture_bytes(image, path.suffix.lower()))

@@ -1,8 +1,4 @@
-"""What the pixels of an image see of a mesh or a cloud, by a z-buffer in numpy, and pictures of them.
-
-No GPU and no window is needed. Everything is given from the surface's point of view: where it is seen, its normal and
-its own colour there, as a trace of a field gives it (`Seen`); `shade` makes pictures of either.
-"""
+"""What the pixels of an image see of a mesh or a cloud, by a z-buffer in numpy: a `Seen`, as of a traced field."""
 
 from __future__ import annotations
 
@@ -28,12 +24,9 @@ Painted = Mesh | TexturedMesh
 
 
 def read_painted(path: str | Path) -> Painted:
-    """Read a mesh or a cloud to be drawn: with the image over it, where an OBJ or glTF file has one.
+    """Read a mesh or a cloud to draw, with its texture if an OBJ or glTF file has one; raises InputError.
 
     An OBJ whose materials or images are missing is read without them.
-
-    Raises:
-        InputError: see `read_surface`.
     """
     path = Path(path)
     if path.suffix.lower() in (".obj", ".glb", ".gltf"):
@@ -47,23 +40,11 @@ def read_painted(path: str | Path) -> Painted:
 
 
 def mesh_view(mesh: Painted, camera: Camera) -> Seen:
-    """What the pixels see of a mesh; the part of it behind the camera is cut away.
+    """What the pixels of a camera see of a mesh, in float32; the part behind the camera is cut away.
 
-    Normals are those of the vertices, interpolated in space (not on the screen) and made unit again; they point where
-    the mesh has them point: away from the camera, on faces seen from inside. The colours of a `Surface` are
-    interpolated likewise. Those of a `TexturedMesh` are looked up at the one point of the surface in the middle of each
-    pixel, between the four nearest texels in linear light, and not filtered beyond that: where a texture is finer than
-    the pixels, draw more pixels and average them (`compare.draw`).
-
-    Args:
-        mesh: without normals, those of its faces are averaged at the vertices.
-        camera: in the mesh's coordinates.
-
-    Returns:
-        One row per pixel that sees the mesh, in float32.
-
-    Raises:
-        ValueError: a `TexturedMesh` has no colours.
+    Normals (by default the mean of the faces') and colours of vertices are interpolated in space, not on the screen.
+    Colours of a `TexturedMesh` are bilinear in linear light at the middle of each pixel: for textures finer than the
+    pixels, draw more pixels and average them.
     """
     pixel, face, weights = _visible(mesh.vertices, mesh.faces, camera)
     corners = mesh.faces[face]
@@ -82,17 +63,9 @@ def mesh_view(mesh: Painted, camera: Camera) -> Seen:
 
 
 def cloud_view(surface: Mesh, camera: Camera, *, point_size: float | None = None) -> Seen:
-    """What the pixels see of a cloud whose points are discs of one size on the screen.
+    """What the pixels see of a cloud whose points are discs, ``point_size`` pixels wide; by default they touch.
 
-    All pixels of a disc see its point. Where there is no normal, the surface is taken to face the camera.
-
-    Args:
-        surface: its vertices, with their normals and colours, are drawn; faces are not.
-        camera: in the cloud's coordinates.
-        point_size: diameter of the discs in pixels; by default such that they touch.
-
-    Returns:
-        One row per pixel that sees a point, in float32.
+    All pixels of a disc see its point. Points without a normal face the camera.
     """
     xy, z = (array.numpy() for array in camera.project(torch.from_numpy(surface.vertices)))
     front = np.flatnonzero(z > _near(z))
@@ -198,21 +171,12 @@ def _nearest_points(xy: Float64, z: Float64, size: tuple[int, int], diameter: fl
 
 
 def picture_of(
-    surface: Mesh,
-    camera: Camera,
-    *,
-    point_size: float | None = None,
-    samples: int = 2,
-    shading: str | None = None,
+    surface: Mesh, camera: Camera, *, point_size: float | None = None, samples: int = 2, shading: str | None = None
 ) -> Image:
-    """Draw a mesh, its back faces reddish, or a cloud as discs, on white, as ``mplicits render`` does by default.
+    """A picture of a mesh, or of a cloud as discs, on white, as ``mplicits render`` draws it by default.
 
-    Args:
-        surface: what to draw; with no faces it is a cloud. Colours and normals are used where there are any.
-        camera: from where, and how large; in the surface's coordinates.
-        point_size: diameter of a cloud's discs in pixels; by default such that they touch.
-        samples: per pixel and direction.
-        shading: one of `SHADINGS` that needs no field; None is "lambert", or what the surface can show.
+    ``point_size`` is the diameter of discs in pixels (by default they touch), ``samples`` is per pixel and direction,
+    and ``shading`` one of `SHADINGS` that needs no field.
     """
     fine, solid = camera.resized(camera.width * samples, camera.height * samples), bool(len(surface.faces))
     if solid:

@@ -1,6 +1,6 @@
-"""Colours for what an image sees: pure functions of `Seen`, on its device, for the pixels that see something.
+"""Colours for what an image sees: shadings, shadows, occlusion, curvature and matcaps, as functions of `Seen`.
 
-Fields, meshes and clouds, in pictures, films and the viewer, all stand under these lamps and have these colour maps.
+Fields, meshes and clouds, in pictures and films, share these lamps and colour maps.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
@@ -45,33 +44,19 @@ def soft_shadow(
     bound: float = BOUNDING_RADIUS,
     max_steps: int = 160,
 ) -> Tensor:
-    """How much of a distant lamp each point sees, in [0, 1]; the shadow's edge blurs with the distance it falls.
+    """How much of a distant lamp each point sees, ``(P,)`` in [0, 1]; edges blur with the distance a shadow falls.
 
-    A ray that meets the surface is dark, however thin the surface is, so that the core of a shadow is that of the
-    lamp's centre. Another ray passes the surface at distance f after t, and is as light as its narrowest place:
+    A ray that meets the surface is dark. Another passes at distance f after t, and its narrowest place counts:
 
         u = min_t f / (s t),    v = u² (3 − 2 u) for u < 1, else 1,
 
-    with s = ``softness``, or the sine of the lamp's height over the tangent plane if that is less: what lies below the
-    horizon gives no light in any case, so that planes and convex shapes are never shadowed by themselves.
+    with s = ``softness``, or the sine of the lamp's height over the tangent plane if that is less, so that convex
+    shapes have no shadows on themselves. Steps are those of a cone of slope s that must not touch the surface,
+    (f − s t) / (1 + s); once it does, half of f or a part of the cone's radius. Where a coarse level stands for finer
+    ones (f ≥ δ), the surface may be nearer by δ.
 
-    Steps are those of a cone of slope s that must not touch the surface, (f − s t) / (1 + s); once it does, half of
-    f or a part of the cone's radius, so that little of the minimum is missed, but never more than f. Where a coarse
-    level stands for finer ones (f ≥ δ), the surface may be nearer by δ, so that is taken off.
-
-    Args:
-        field: a 3-D field.
-        points: ``(P, 3)`` on its surface, or near it.
-        normals: ``(P, 3)`` unit normals; a point that faces away from the lamp is dark.
-        towards_light: ``(3,)`` unit direction to the lamp.
-        level: the level that casts the shadow; a coarse one is cheaper.
-        softness: s > 0; 1e-3 is sharp.
-        offset: height above the level's own surface from which rays start, so that nothing shadows itself.
-        bound: radius of a sphere around the origin that holds the surface.
-        max_steps: after so many steps a ray is judged by what it has met.
-
-    Raises:
-        ValueError: ``softness``, ``offset``, ``bound`` or ``max_steps`` is not positive.
+    ``points`` and unit ``normals`` are ``(P, 3)``, ``towards_light`` ``(3,)``. Rays start ``offset`` above the surface
+    of ``level`` and end at the radius ``bound``. Raises a ValueError for a number that is not positive.
     """
     for name, number in (("softness", softness), ("offset", offset), ("bound", bound), ("max_steps", max_steps)):
         if not number > 0:
@@ -109,21 +94,9 @@ def soft_shadow(
 def ambient_occlusion(
     field: Field, points: Tensor, normals: Tensor, *, level: int = -1, reach: float = 0.15, samples: int = 5
 ) -> Tensor:
-    """How open the surroundings of each point are: 1 on a plane or a convex shape, 0 in the depth of a slit.
+    """How open the surroundings of points ``(P, 3)`` are: 1 on a plane or a convex shape, 0 in the depth of a slit.
 
-    The mean of clamp((f(p + d n) − f(p)) / d, 0, 1) over ``samples`` distances d along the normal, evenly spaced up
-    to ``reach``. In a concave corner f grows slower than d, and the further away the less.
-
-    Args:
-        field: a 3-D field.
-        points: ``(P, 3)`` on its surface, or near it.
-        normals: ``(P, 3)`` unit normals.
-        level: the level to ask; a coarse one is cheaper.
-        reach: how far around to look, > 0.
-        samples: values asked for along each normal, ≥ 1.
-
-    Raises:
-        ValueError: ``reach`` or ``samples`` is not positive.
+    The mean of clamp((f(p + d n) − f(p)) / d, 0, 1) over ``samples`` distances d along the normal, up to ``reach``.
     """
     if not reach > 0 or samples < 1:
         raise ValueError(f"reach={reach}, samples={samples}: expected reach > 0 and samples ≥ 1")
@@ -153,22 +126,13 @@ def _light_through(u: Tensor) -> Tensor:
 
 @torch.no_grad()
 def level_set_curvature(field: Field, points: Tensor, *, level: int = -1, step: float = 2e-3) -> Tensor:
-    """H = ½ div(∇f / |∇f|) of the level set through each point, by central differences: 1/r on a sphere.
+    """H = ½ div(∇f / |∇f|) ``(P,)`` of the level set through each point, by central differences: 1/r on a sphere.
 
-    The unit gradient n changes only within the tangent plane, ⟨n, ∂n⟩ = 0, so that along two tangents a and b
+    The unit gradient n changes only within the tangent plane, so that along two tangents a and b, with h = ``step``,
 
         2 H = ⟨a, n(p + h a) − n(p − h a)⟩ / 2h + ⟨b, n(p + h b) − n(p − h b)⟩ / 2h.
 
-    Convex is positive. The error grows with h² and with (rounding of n) / h.
-
-    Args:
-        field: a 3-D field; where its gradient is zero there is no level set, and H is 0.
-        points: ``(P, 3)``.
-        level: the level to ask.
-        step: h; details smaller than it are averaged.
-
-    Raises:
-        ValueError: ``step`` is not positive.
+    Convex is positive; where the gradient is zero, H is 0. The error grows with h² and with (rounding of n) / h.
     """
     if not step > 0:
         raise ValueError(f"step={step}: expected a number > 0")
@@ -190,11 +154,7 @@ def _tangents(n: Tensor) -> Tensor:
 
 
 def load_matcap(name: str | Path) -> Tensor:
-    """One of `MATCAPS`, or a PNG or JPEG of a sphere that fills it → ``(H, W, 3)`` display RGB in [0, 1].
-
-    Raises:
-        InputError: no such file, or it is not an image.
-    """
+    """One of `MATCAPS`, or a picture of a sphere that fills it → ``(H, W, 3)`` display RGB in [0, 1]."""
     if str(name) in MATCAPS:
         normals = _sphere(256)
         return torch.from_numpy(_clay(normals) if str(name) == "clay" else _chrome(normals))
@@ -209,9 +169,9 @@ def load_matcap(name: str | Path) -> Tensor:
 
 
 def sample_matcap(matcap: Tensor, normals: Tensor) -> Tensor:
-    """Colours of camera-space normals ``(P, 3)`` (x right, y up, z towards the eye) → ``(P, 3)``, bilinear.
+    """Colours of camera-space normals ``(P, 3)`` (x right, y up, z towards the eye), bilinear.
 
-    The sphere touches the four edges of the image. Normals that face away take the colour of its rim.
+    Normals that face away take the colour of the sphere's rim.
     """
     across = normals[:, :2]
     length = across.norm(dim=1, keepdim=True)
@@ -280,17 +240,11 @@ GAMMA = 2.2  # between display values, in which images are stored, and light, wh
 
 @dataclass(frozen=True)
 class Lamps:
-    """The studio of all pictures: directions in the camera's axes (right, up, towards the eye), and linear light.
+    """The lamps of all pictures: directions in the camera's axes (right, up, towards the eye), and linear light.
 
     Attributes:
-        key: direction to the key lamp.
-        fill: direction to the fill lamp.
-        raking: direction to a lamp twelve degrees above a face that looks at the camera, which a wave of one degree
-            makes a twelfth brighter.
-        key_light: on a surface that faces the lamp.
-        fill_light: likewise.
-        sky_light: from above; a little cool.
-        ground_light: from below; a little warm.
+        raking: twelve degrees above a face that looks at the camera; a wave of one degree makes it a twelfth brighter.
+        sky_light: from above.
         back: display colour of back faces.
         behind: cosine of the view with a normal beyond which the back is seen, not a rim with a finer level's normal.
     """
@@ -348,28 +302,13 @@ def shade(
     level: int = -1,
     options: ShadeOptions | None = None,
     matcap: Tensor | None = None,
-    reference: KDTree | None = None,
     values: Tensor | None = None,
 ) -> Tensor:
-    """Colour the pixels that see something.
+    """Colours ``(P, 3)``, display RGB in [0, 1], of the pixels that see something.
 
-    Args:
-        seen: what they see.
-        shading: one of `SHADINGS`.
-        camera: in the coordinates of ``seen``; lamps and matcaps turn with it.
-        field: for shadows, occlusion and curvature.
-        level: the level that is seen.
-        options: settings.
-        matcap: ``(H, W, 3)`` from `load_matcap`; by default ``options.matcap`` is loaded.
-        reference: the cloud from which the error is measured.
-        values: ``(P,)`` numbers to map to colours, where they are known and need not be measured.
-
-    Returns:
-        ``(P, 3)`` display RGB in [0, 1].
-
-    Raises:
-        ValueError: no such shading, or it needs a field, colours or a reference that is not there.
-        InputError: the matcap of the options cannot be read.
+    ``level`` of ``field`` is what is seen; lamps and matcaps turn with ``camera``. ``values`` ``(P,)`` are mapped to
+    colours if given, and else measured. Raises a ValueError for a shading that is unknown, or needs a field, colours or
+    a reference that is not there; InputError for a matcap that cannot be read.
     """
     options = options or ShadeOptions()
     if shading not in SHADINGS:
@@ -390,7 +329,7 @@ def shade(
     if shading == "matcap":
         return sample_matcap(load_matcap(options.matcap) if matcap is None else matcap, _view_normals(seen, camera))
     if values is None:
-        values = measure(seen, shading, field=field, level=level, reference=reference, detail=options.detail)
+        values = measure(seen, shading, field=field, level=level, detail=options.detail)
     low, high = value_limits(values, shading, options)
     # What is near is light, what is far from the reference dark: of those two maps the light end is the high one.
     colors = apply_color_map(values, (low, high) if shading == "curvature" else (high, low), COLOR_MAPS[_MAPS[shading]])
@@ -399,27 +338,10 @@ def shade(
     return colors * (1 - options.relief * (1 - _facing(seen)))[:, None]
 
 
-def measure(
-    seen: Seen,
-    shading: str,
-    *,
-    field: Field | None = None,
-    level: int = -1,
-    reference: KDTree | None = None,
-    detail: float = 4e-3,
-) -> Tensor:
-    """The numbers ``(P,)`` that "depth", "curvature" and "error" show, in the units of ``seen``.
+def measure(seen: Seen, shading: str, *, field: Field | None = None, level: int = -1, detail: float = 4e-3) -> Tensor:
+    """The numbers ``(P,)`` that "depth" and "curvature" show, in the units of ``seen``.
 
-    Args:
-        seen: what the pixels see.
-        shading: one of the three.
-        field: whose curvature.
-        level: of the field.
-        reference: the cloud from which the error is measured.
-        detail: step of the differences of which the curvature is made, see `level_set_curvature`.
-
-    Raises:
-        ValueError: another shading, or it needs a field or a reference that is not there.
+    ``detail`` is the step of `level_set_curvature`. Raises a ValueError if a field is missing.
     """
     if shading == "depth":
         return seen.depth
@@ -427,19 +349,13 @@ def measure(
         if field is None:
             raise ValueError("shading='curvature': needs a field; a mesh has none")
         return level_set_curvature(field, seen.position, level=level, step=detail)
-    if shading == "error":
-        if reference is None:
-            raise ValueError("shading='error': needs a reference cloud to measure from")
-        distances = reference.query(seen.position.detach().cpu().double().numpy())[0]
-        return torch.as_tensor(np.asarray(distances)).to(seen.position)
-    raise ValueError(f"shading={shading!r}: expected one of {', '.join(_MAPS)}")
+    raise ValueError(f"shading={shading!r}: expected depth, curvature, or values that were measured before")
 
 
 def value_limits(values: Tensor, shading: str, options: ShadeOptions) -> tuple[float, float]:
-    """The values at the two ends of the colour map, for a legend, or for all frames of a turntable.
+    """The values at the ends of the colour map: ``options.limits``, or those that hold the values.
 
-    They are ``options.limits`` if given. Otherwise "depth" spans all ``values``; "error" starts at 0 and holds
-    ``options.quantile`` of them; "curvature" does so too, and is symmetric.
+    "depth" spans all; "error" starts at 0 and holds ``options.quantile`` of them; "curvature" is symmetric as well.
     """
     if options.limits is not None:
         return options.limits
@@ -455,13 +371,9 @@ def value_limits(values: Tensor, shading: str, options: ShadeOptions) -> tuple[f
 
 
 def apply_color_map(values: Tensor, limits: tuple[float, float], table: Float32) -> Tensor:
-    """Colours of ``values`` ``(P,)`` → ``(P, 3)``, linear between the entries of ``table`` and clamped at its ends.
+    """Colours ``(P, 3)`` of values ``(P,)``, linear between the entries of ``table`` ``(K, 3)``, clamped at its ends.
 
-    Args:
-        values: numbers.
-        limits: the values at the first and at the last entry; they may run backwards. Where they are equal, all
-            values get the middle.
-        table: ``(K, 3)`` display RGB.
+    ``limits`` may run backwards; where they are equal, all values get the middle.
     """
     low, high = limits
     share = (values - low) / (high - low) if high != low else torch.full_like(values, 0.5)
@@ -487,11 +399,7 @@ def compose(seen: Seen, rgb: Tensor, *, background: Sequence[float] | None = (1.
 
 
 def downsample(image: Image, factor: int) -> Image:
-    """Average blocks of ``factor`` × ``factor`` pixels; of RGBA the colours by their alpha, so that rims keep theirs.
-
-    Raises:
-        ValueError: the factor is below 1, or does not divide the sides of the image.
-    """
+    """Average blocks of ``factor`` × ``factor`` pixels; colours of RGBA are weighted by alpha. Raises ValueError."""
     height, width, channels = image.shape
     if factor < 1 or height % factor or width % factor:
         raise ValueError(f"factor={factor}: expected a divisor of both sides of a {width} × {height} image")
@@ -508,10 +416,9 @@ def downsample(image: Image, factor: int) -> Image:
 
 
 def _lambert(seen: Seen, camera: Camera, field: Field | None, level: int, options: ShadeOptions) -> Tensor:
-    """Albedo times the light of two lamps and of sky and ground, the lamps a little off the camera's axis.
+    """Albedo times the light of two lamps, sky and ground.
 
-    The key lamp is cut off by shadows, and everything else by occlusion; half of it dims the key lamp as well, which
-    keeps narrow creases readable in full light.
+    Shadows dim the key lamp, and occlusion all other light; half of it dims the key lamp too, for visible creases.
     """
     if field is None and (options.shadows or options.occlusion):
         raise ValueError("shading='lambert': shadows and occlusion are traced in a field, and there is none")

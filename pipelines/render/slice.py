@@ -1,7 +1,6 @@
-"""A plane through a field: its values there, and the picture of them (paper Fig. 4).
+"""A plane through a field: its values there, and the picture of them (paper Fig. 4), in the field's coordinates.
 
-A plane is given by a point ``origin`` and two orthogonal unit vectors: ``u`` points right in the picture and ``v``
-up, so that it is seen from the side to which ``u × v`` points. Everything is in the field's own coordinates.
+Unit vectors ``u`` (right) and ``v`` (up) span the plane, seen from the side to which ``u × v`` points.
 """
 
 from __future__ import annotations
@@ -35,11 +34,8 @@ class Style:
     """How slices are drawn; widths are in pixels of a picture 640 pixels high.
 
     Attributes:
-        tint: the share of its colour that a band lays over what is below.
-        fade: distance, as a share of the half height, at which 1 − 1/e of the far colour is reached.
-        line: width of an iso-line; every fifth is drawn stronger.
-        zero_line: width of the surface.
-        outline: width of a band's edge.
+        tint: share of its colour that a band lays over what is below.
+        fade: share of the half height at which 1 − 1/e of the far colour is reached.
     """
 
     tint: float = 0.34
@@ -53,12 +49,9 @@ STYLE = Style()
 
 
 def plane_axes(normal: Vector, *, up: str = "y") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The axes (u, v) of a plane seen from the side to which ``normal`` points, with ``up`` upwards in the picture.
+    """The axes (u, v) of a plane seen from the side to which ``normal`` points, with ``up`` ("y" or "z") upwards.
 
-    A plane across the up axis itself has up another axis: −z for ``up="y"``, y for ``up="z"``, as on a map.
-
-    Raises:
-        ValueError: the normal has no direction, or ``up`` is neither "y" nor "z".
+    On a plane across the up axis, −z (for "y") or y (for "z") is up, as on a map. Raises ValueError.
     """
     n = np.asarray(normal, np.float64)
     length = float(np.linalg.norm(n))
@@ -76,17 +69,9 @@ def plane_axes(normal: Vector, *, up: str = "y") -> tuple[NDArray[np.float64], N
 
 
 def slice_points(*, origin: Vector, u: Vector, v: Vector, half_size: float, size: tuple[int, int]) -> Tensor:
-    """The points ``(H, W, 3)`` at the centres of a picture's pixels, in float64.
+    """The points ``(H, W, 3)`` in float64 at the centres of a picture's pixels, around ``origin``.
 
-    Args:
-        origin: the point in the middle of the picture.
-        u: unit vector to the right.
-        v: unit vector upwards.
-        half_size: half the height of the picture; pixels are square.
-        size: width and height in pixels.
-
-    Raises:
-        ValueError: ``half_size`` or ``size`` is not > 0.
+    ``half_size`` is half the height of the picture, ``size`` its width and height in pixels. Raises ValueError.
     """
     width, height = size
     if not (0 < half_size < math.inf and width > 0 and height > 0):
@@ -98,38 +83,15 @@ def slice_points(*, origin: Vector, u: Vector, v: Vector, half_size: float, size
     return torch.from_numpy(points)
 
 
-def slice_field(
-    field: Field,
-    *,
-    origin: Vector,
-    u: Vector,
-    v: Vector,
-    half_size: float,
-    size: tuple[int, int],
-    level: int = -1,
-) -> Tensor:
-    """Values ``(H, W)`` of one level at the centres of a picture's pixels, in one inference; see `slice_points`.
-
-    Example:
-        >>> from mplicits.neural_fields import Sphere
-        >>> from mplicits.pipelines.render.slice import slice_field
-        >>> slice_field(Sphere(radius=1), origin=(0, 0, 0), u=(1, 0, 0), v=(0, 1, 0), half_size=2, size=(4, 1))
-        tensor([[5., 1., 1., 5.]])
-    """
-    points = slice_points(origin=origin, u=u, v=v, half_size=half_size, size=size)
-    with torch.inference_mode():
-        return field.value(points.to(field.like), level=level)
-
-
 @dataclass(frozen=True)
 class Slice:
     """The values of all levels on a plane.
 
     Attributes:
-        levels: ``(H, W)`` float32 for each level from the coarsest on; outside the band of a level, the next is equal.
+        levels: ``(H, W)`` float32 each; outside the band of a level, the next is equal.
         bands: ``(H, W)`` bool for each level with a band: where it and every coarser level are in theirs.
         deltas: half-width of each band, in the field's units.
-        pixel: side of a pixel, in the field's units.
+        pixel: side of a pixel, likewise.
         finest: whether the last of ``levels`` is the field's finest.
     """
 
@@ -141,14 +103,7 @@ class Slice:
 
 
 def take_slice(
-    field: Field,
-    *,
-    origin: Vector,
-    u: Vector,
-    v: Vector,
-    half_size: float,
-    size: tuple[int, int],
-    level: int = -1,
+    field: Field, *, origin: Vector, u: Vector, v: Vector, half_size: float, size: tuple[int, int], level: int = -1
 ) -> Slice:
     """Evaluate every level up to ``level``, each one only in the band of the one before; see `slice_points`."""
     level = field.resolve_level(level)
@@ -170,19 +125,10 @@ def take_slice(
 
 
 def draw_slice(taken: Slice, *, iso_step: float, bands: bool = True) -> Image:
-    """The picture ``(H, W, 3)`` of a slice.
+    """The picture ``(H, W, 3)`` of a slice; ``iso_step`` > 0 is in the field's units.
 
-    Sign and distance of the finest level as colour, its iso-lines (every fifth stronger), each band
-    ``|f_i| < δ_i`` tinted and outlined, and the zero set of each level. Lines are as wide at any gradient:
-    their distance from a pixel is ``|f − c| / |∇f|``, with the gradient of the image.
-
-    Args:
-        taken: the values.
-        iso_step: distance between iso-lines, in the field's units.
-        bands: whether to draw the bands.
-
-    Raises:
-        ValueError: ``iso_step`` is not > 0.
+    Sign and distance of the finest level as colour, iso-lines (every fifth stronger), bands ``|f_i| < δ_i``, and the
+    zero set of each level. Lines are equally wide at any gradient: a pixel is ``|f − c| / |∇f|`` away from one.
     """
     if not 0 < iso_step < math.inf:
         raise ValueError(f"iso_step={iso_step}: expected a number > 0")

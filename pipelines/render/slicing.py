@@ -30,18 +30,14 @@ class SliceOptions:
     Attributes:
         level: counted from 0, the coarsest; None is the finest.
         axis: the plane is across this one, "x", "y" or "z".
-        at: where on that axis; None is the middle of the shape.
-        percent: where on that axis instead, 0 where the shape begins and 100 where it ends.
-        normal: of a plane across no axis, instead; the side it points to is the one seen.
+        at: place on that axis; None is the middle of the shape.
+        percent: place on that axis instead, from 0 where the shape begins to 100 where it ends.
+        normal: of a plane across no axis, instead; it points to the viewer.
         point: a point of that plane; None is the middle of the shape.
         up: "y" or "z", the axis that points up in the picture.
         size: width and height of the picture, without its legend.
-        lines: about how many iso-lines there are room for from the bottom of the picture to its top.
-        zoom: how much larger than to show the whole shape.
-        center: what is in the middle of the picture (its nearest point on the plane); None is the middle of the shape.
-        bands: whether to draw the bands.
-        frames: of a film.
-        fps: of a film.
+        lines: about how many iso-lines fit between bottom and top.
+        center: the middle of the picture (its nearest point on the plane); None is that of the shape.
     """
 
     level: int | None = None
@@ -67,22 +63,11 @@ def slice_run(
     *,
     progress: Callable[[int], None] | None = None,
 ) -> str:
-    """Draw a plane through the field of a run.
+    """Draw a plane through the field of a run to a picture or film → what was drawn, in a few words.
 
-    A film's plane starts in the middle of the shape, goes through to both its ends and comes back, so that it
-    can be repeated.
-
-    Args:
-        run: run directory or .safetensors file.
-        out: a .png or .jpg picture, or an .mp4 or .gif film.
-        options: which plane, and how.
-        progress: called with the number of frames of a film so far.
-
-    Returns:
-        What was drawn, in a few words.
-
-    Raises:
-        InputError: there is no such run or level, the plane misses the unit sphere, or the file cannot be written.
+    The plane of a film goes from the middle of the shape to both its ends and back, so that it can be repeated.
+    ``progress`` is called with the number of frames so far. Raises an InputError if there is no such run or level, the
+    plane misses the unit sphere, or the file cannot be written.
     """
     options, out = options or SliceOptions(), Path(out)
     file = find_field(run)
@@ -128,11 +113,7 @@ class _View:
         self.center = center @ axes[:, :2].T  # on the plane of offset 0
 
     def offset(self) -> float:
-        """Where the plane that was asked for is.
-
-        Raises:
-            InputError: it does not pass through the unit sphere, outside which the field knows nothing.
-        """
+        """Place of the plane along the normal; raises an InputError if it misses the unit sphere."""
         options = self.options
         offset, flag = self.middle, "--at"
         if options.normal is not None and options.point is not None:

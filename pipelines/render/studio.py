@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -45,25 +44,12 @@ def photograph_mesh(
     depths: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> PosedImages:
-    """Posed images of a mesh, as `render_scene` makes them of exact scenes, in the coordinates of its file.
+    """Posed images of a mesh in its file's coordinates, as `render_scene` makes them of exact scenes.
 
-    What has no colours is grey clay, and always lit: bare, it would be a silhouette.
-
-    Args:
-        path: a file that `read_painted` knows.
-        views: how many images.
-        size: width and height of the images, in pixels.
-        seed: of the cameras and the sparse points.
-        samples: rays per pixel and direction.
-        up: "y" or "z", the axis that points up.
-        shaded: whether a fixed lamp lights the mesh; without, the images show its colours themselves.
-        glossy: whether the lamp is reflected, in a highlight that moves with the eye.
-        depths: whether each image has the depths of its pixels' centres.
-        progress: called with ``(done, total)`` after every image.
-
-    Raises:
-        InputError: the mesh cannot be read, or has no faces.
-        ValueError: ``views``, ``size`` or ``samples`` is not positive.
+    A mesh without colours is grey clay, and always lit. ``size`` is the side of the images in pixels, ``samples`` rays
+    per pixel and direction, ``seed`` that of the cameras and the sparse points. A fixed lamp lights the mesh if
+    ``shaded``, with a highlight if ``glossy``; ``depths`` are those of the pixels' centres. Raises an InputError if the
+    mesh cannot be read or has no faces.
     """
     if samples < 1:
         raise ValueError(f"samples={samples}: expected at least one")
@@ -72,7 +58,7 @@ def photograph_mesh(
         raise InputError(f"{path}: has no faces, so there is no surface to photograph; give a mesh")
     ball = Similarity.to_unit_sphere(mesh.vertices[np.unique(mesh.faces)])
     mesh = dataclasses.replace(mesh, vertices=ball.to_unit(mesh.vertices))
-    light = _Light(shaded=shaded or not _has_colors(mesh), glossy=glossy)
+    light = {"shaded": shaded or not _has_colors(mesh), "glossy": glossy}
     # About as many as structure from motion would give.
     points, _ = sample_points(Mesh(mesh.vertices, mesh.faces), 1000, np.random.default_rng(seed))
     images: list[PosedImage] = []
@@ -94,26 +80,13 @@ def photograph_mesh(
 
 
 def true_mesh(path: str | Path) -> Mesh:
-    """What was photographed, with the colours of its vertices, as a mesh to hold reconstructions against.
-
-    Args:
-        path: a mesh file.
-
-    Raises:
-        InputError: it cannot be read, or has no faces.
-    """
+    """The photographed mesh with colours at its vertices, to compare reconstructions with; raises InputError."""
     surface = read_reference(path)
     return dataclasses.replace(surface, normals=vertex_normals(surface.vertices, surface.faces))
 
 
 def sees(camera: Camera, seen: Seen, points: Float64) -> NDArray[np.bool_]:
-    """Which of the points ``(P, 3)`` a camera sees: those in its picture that are where the surface in their pixel is.
-
-    Args:
-        camera: in the coordinates of the points.
-        seen: what its pixels see.
-        points: of the surface.
-    """
+    """Which surface points ``(P, 3)`` a camera sees: those in its picture at the place that ``seen`` has there."""
     pixels, depths, found = camera.in_view(points)
     if not len(seen.pixel):
         return np.zeros_like(found)
@@ -128,31 +101,24 @@ def sees(camera: Camera, seen: Seen, points: Float64) -> NDArray[np.bool_]:
     return found
 
 
-class _Light(NamedTuple):
-    """How the studio's lamp is used; see `lit`."""
-
-    shaded: bool
-    glossy: bool
-
-
 def _has_colors(mesh: Painted) -> bool:
     return mesh.has_colors if isinstance(mesh, TexturedMesh) else mesh.colors is not None
 
 
-def _photograph(mesh: Painted, camera: Camera, samples: int, light: _Light) -> tuple[Float32, Float32]:
+def _photograph(mesh: Painted, camera: Camera, samples: int, light: dict[str, bool]) -> tuple[Float32, Float32]:
     """Display RGB ``(H, W, 3)`` with straight alpha, and the mask ``(H, W)``."""
     parts = [_strip(mesh, fine, samples, light) for fine in fine_strips(camera, samples, pixels=1 << 21)]
     color, mask = (np.concatenate(part) for part in zip(*parts, strict=True))
     return color, mask
 
 
-def _strip(mesh: Painted, fine: Camera, samples: int, light: _Light) -> tuple[Float32, Float32]:
+def _strip(mesh: Painted, fine: Camera, samples: int, light: dict[str, bool]) -> tuple[Float32, Float32]:
     """The same, of a strip whose camera has ``samples`` pixels per pixel and direction."""
     seen = mesh_view(mesh, fine)
     own = np.full((len(seen.pixel), 3), CLAY) if seen.color is None else seen.color.double().numpy()
     sent, mask = np.zeros((fine.height * fine.width, 3)), np.zeros(fine.height * fine.width, bool)
     normals, directions = seen.normal.double().numpy(), seen.direction.double().numpy()
-    sent[seen.pixel] = lit(srgb_to_linear(own), normals, directions, shaded=light.shaded, glossy=light.glossy)
+    sent[seen.pixel] = lit(srgb_to_linear(own), normals, directions, **light)
     mask[seen.pixel] = True
     return developed(sent.reshape(fine.height, fine.width, 3), mask.reshape(fine.height, fine.width), samples)
 

@@ -1,8 +1,4 @@
-"""From a field and a camera to what every pixel sees: the coarse-to-fine trace, then one jet for each pixel.
-
-`Seen` is the same whether a surface was traced in a field or rasterised from a mesh. Images that are too large to be
-worked on at once are cut into strips.
-"""
+"""What every pixel sees of a field: the coarse-to-fine trace, then one jet per pixel; large images in strips."""
 
 from __future__ import annotations
 
@@ -15,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ...datasets.cameras import Camera
-from ...neural_fields import Field, Siren, TextureField, map_colors, sphere_trace
+from ...neural_fields import Field, Siren, sphere_trace
 from ...neural_fields.networks.multiscale import as_levels, choose_levels, levels_of
 from ...neural_fields.tracing.cones import CONE_LIPSCHITZ, CONE_STEPS, cone_starts
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, MAX_STEPS, Hits, march_constants
@@ -28,10 +24,10 @@ class Precision:
     """How exactly pictures are traced.
 
     Attributes:
-        tolerance: of depths, in pixels; the jet's Newton step, which costs nothing, leaves about its square.
-        resolution: of the march, in pixels: two crossings nearer to each other may be overlooked.
-        newton: the longest Newton step, in pixels; a hit on the jump at a gate's edge is right where it is.
-        shallow: slope along the ray below which no Newton step is made: the surface may turn away before it arrives.
+        tolerance: of depths, in pixels; the Newton step leaves about its square.
+        resolution: of the march, in pixels; nearer crossings may be missed.
+        newton: longest Newton step, in pixels; a hit on the jump at a gate's edge is right where it is.
+        shallow: slope along the ray below which no Newton step is made.
         nearest: least distance of what a camera in the shape looks at, in the field's units.
     """
 
@@ -47,7 +43,7 @@ PRECISION = Precision()
 
 @dataclass(frozen=True)
 class Seen:
-    """One row for each pixel that sees the surface; nothing is kept, or shaded, for the others.
+    """One row for each pixel that sees the surface, traced in a field or rasterised from a mesh.
 
     Attributes:
         size: width and height of the image.
@@ -56,7 +52,7 @@ class Seen:
         position: ``(P, 3)`` the point seen.
         normal: ``(P, 3)`` unit outward normal there.
         direction: ``(P, 3)`` unit direction of the ray, away from the eye.
-        color: ``(P, 3)`` the surface's own colour in [0, 1], where it has one.
+        color: ``(P, 3)`` the surface's own colour in [0, 1], if it has one.
     """
 
     size: tuple[int, int]
@@ -77,9 +73,7 @@ class Seen:
 def strips(camera: Camera, pixels: Callable[[], int]) -> Iterator[tuple[int, Camera]]:
     """Cut a camera into strips of whole rows: the first row and the camera of each.
 
-    Args:
-        camera: of the whole image.
-        pixels: asked before each strip for about how many pixels it is to have.
+    ``pixels`` is called before each strip and returns about how many pixels it is to have.
     """
     first = 0
     while first < camera.height:
@@ -101,7 +95,6 @@ def trace_view(
     *,
     level: int = -1,
     normal_level: int | None = None,
-    texture: TextureField | None = None,
     colors: Callable[[Tensor], Tensor] | None = None,
     budget: Sequence[int] | None = None,
     device: torch.device | str = "cpu",
@@ -109,16 +102,14 @@ def trace_view(
     """What the pixels of a camera see of a level of a field.
 
     The jet that gives the normal also gives the value at the hit, so the position takes one more Newton step along the
-    ray. With a finer ``normal_level`` the gradient is that level's instead (neural normal mapping, paper Sec. 3):
-    details of the fine level for the price of one evaluation, on the silhouette of the coarse one.
+    ray. With a finer ``normal_level`` the normal is that level's gradient (neural normal mapping, paper Sec. 3).
 
     Args:
         field: three-dimensional, on ``device``.
         camera: in the field's coordinates.
         level: whose surface is seen.
         normal_level: whose gradient is the normal; by default ``level``.
-        texture: the colours of the surface, mapped onto whichever level is seen (paper Sec. 3, neural texture mapping).
-        colors: they may also come from any function of points ``(P, 3)``.
+        colors: of points ``(P, 3)``, mapped onto the level that is seen (paper Sec. 3, neural texture mapping).
         budget: steps on each level, for the paper's fixed mode; by default the adaptive one (see `sphere_trace`).
         device: where to work, and where the result is.
 
@@ -127,8 +118,6 @@ def trace_view(
     """
     level = field.resolve_level(level)
     normal_level = level if normal_level is None else field.resolve_level(normal_level)
-    if texture is not None:
-        colors = lambda points: map_colors(texture, points).values  # noqa: E731  either way it is a function
     if budget is None and not camera.distortion and _draws_at_once(field, max(level, normal_level), device):
         return _draw(field, camera, level, normal_level, colors)
     eye, directions = camera.rays(device=device)
@@ -201,13 +190,7 @@ def see_hits(
 
 
 def trace_hits(
-    field: Field,
-    camera: Camera,
-    eye: Tensor,
-    directions: Tensor,
-    *,
-    level: int,
-    budget: Sequence[int] | None = None,
+    field: Field, camera: Camera, eye: Tensor, directions: Tensor, *, level: int, budget: Sequence[int] | None = None
 ) -> Hits:
     """Trace the rays ``(H, W, 3)`` of a camera to a tenth of a pixel, tiles of them first."""
     if budget is not None:

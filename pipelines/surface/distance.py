@@ -1,13 +1,16 @@
-"""Exact signed distances to a triangle mesh."""
+"""Exact signed distances to a triangle mesh, and a closed mesh as a field."""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from torch import Tensor
 
-from ...neural_fields import Mesh
-from .surface import face_normals
+from ...neural_fields import Jet, Mesh
+from ...neural_fields.fields.field import OneLevelField
+from .surface import face_normals, is_closed, volume
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -16,16 +19,11 @@ Int64 = NDArray[np.int64]
 class MeshDistance:
     """Signed distance to a mesh, negative inside, exact to rounding.
 
-    Faces are found through a k-d tree of their centres, long faces cut into pieces for it; the search widens until no
-    face left out can be nearer. The sign is that of the angle-weighted pseudo-normal of the nearest face, edge or
-    vertex (Bærentzen and Aanæs, IEEE TVCG 2005), which is exact for a closed, consistently oriented mesh; near
-    a hole it is the side of the nearest face.
+    The search in a k-d tree of face centres (long faces in pieces) widens until no face left out can be nearer. The
+    sign is that of the angle-weighted pseudo-normal of the nearest face, edge or vertex (Bærentzen and Aanæs, IEEE TVCG
+    2005), exact for closed, consistently oriented meshes.
 
-    Args:
-        mesh: equal vertices are made one.
-
-    Raises:
-        ValueError: the mesh has no faces of any area.
+    Raises a ValueError for a mesh without a face of any area; equal vertices are made one.
     """
 
     pairs_at_once = 1 << 19  # rows times candidates looked at together: about 100 MiB of temporaries
@@ -48,15 +46,10 @@ class MeshDistance:
         return self.with_slope(points)[0]
 
     def with_slope(self, points: Float64, *, certain: bool = True) -> tuple[Float64, Float64]:
-        """Distances ``(M,)`` of points ``(M, 3)``, and their gradients ``(M, 3)``: away from the nearest point.
+        """Distances ``(M,)`` of points ``(M, 3)`` and their gradients ``(M, 3)``: on the surface, the pseudo-normals.
 
-        On the surface that is the pseudo-normal.
-
-        Args:
-            points: ``(M, 3)``.
-            certain: whether the search widens until no other face can be nearer, which costs much far from the surface.
-                Otherwise it ends after the eight pieces of faces whose centres are nearest: a distance may be too long
-                by the radius of a piece, and is right wherever the nearest face is among theirs.
+        Unless ``certain``, the search ends after the eight pieces whose centres are nearest: a distance may be too long
+        by the radius of a piece, far from the surface above all, where certainty costs much.
         """
         if not certain:
             nearest = np.reshape(self.tree.query(points, k=min(8, len(self.owner)), workers=-1)[1], (len(points), -1))
@@ -97,7 +90,7 @@ class MeshDistance:
 def barycentric_of_nearest(points: Float64, corners: Float64) -> Float64:
     """Weights ``(..., 3)`` of the corners ``(..., 3, 3)`` for the point of each triangle nearest to ``(..., 3)``.
 
-    A weight is exactly 0 where that point is on an edge, two are where it is a corner.
+    A weight is exactly 0 where that point is on an edge; two are at a corner.
     """
     a, b, c = (corners[..., k, :] for k in range(3))
     ab, ac, ap = b - a, c - a, points - a
@@ -151,9 +144,9 @@ def _angle(corners: Float64, k: int) -> Float64:
 
 
 def _pieces(corners: Float64, area: float) -> tuple[Float64, Int64, float]:
-    """Centres ``(P, 3)`` of small pieces of the faces, the faces they belong to ``(P,)``, and their largest radius.
+    """Centres ``(P, 3)`` of pieces of the faces, their faces ``(P,)``, and their largest radius.
 
-    Faces much longer than is usual are halved across their longest edge until none is.
+    Faces much longer than the median are halved across their longest edge until none is.
     """
     lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)  # (F, 3): edges ab, bc, ca
     limit = max(float(np.median(lengths.max(axis=1))), (area / 200_000) ** 0.5)  # at most some 200,000 pieces
@@ -173,3 +166,35 @@ def _pieces(corners: Float64, area: float) -> tuple[Float64, Int64, float]:
     pieces, owner = np.concatenate([p for p, _ in done]), np.concatenate([o for _, o in done])
     centers = pieces.mean(axis=1)
     return centers, owner, float(np.linalg.norm(pieces - centers[:, None], axis=2).max())
+
+
+class MeshField(OneLevelField):
+    """The signed distance to a closed mesh, exact to rounding, in float64 on the CPU, without a graph.
+
+    A mesh that is turned inside out is turned back. Raises a ValueError if it is not closed or encloses nothing.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        super().__init__()
+        if not is_closed(mesh):
+            raise ValueError("mesh: is not closed, so that it has no inside")
+        inside = volume(mesh)
+        if inside == 0:
+            raise ValueError("mesh: encloses nothing")
+        faces = mesh.faces if inside > 0 else mesh.faces[:, ::-1]
+        self.volume, self.distance = abs(inside), MeshDistance(Mesh(mesh.vertices, faces))
+
+    def extra_repr(self) -> str:
+        """How many triangles there are."""
+        return f"faces={len(self.distance.corners)}"
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
+        return self.jet(x, level=level).value
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`; the gradient leads away from the nearest point of the mesh."""
+        self.resolve_level(level)
+        rows = self.check_points(x).detach().reshape(-1, 3).cpu().double().numpy()
+        value, slope = (torch.from_numpy(part).to(x) for part in self.distance.with_slope(rows, certain=False))
+        return Jet(value.reshape(x.shape[:-1]), slope.reshape(x.shape), x.new_empty((*x.shape[:-1], 0)))

@@ -1,14 +1,10 @@
 """How far a mesh is from a reference: the figures of the paper's tables, and a true volumetric IoU.
 
-Both shapes are moved by the similarity that puts the REFERENCE into the unit sphere (paper, Sec. 5); distances are
-between area-weighted uniform samples of the two surfaces. Volumes are summed over columns, lines along one axis: sorted
-along one, the crossings of an oriented closed surface give the winding number between them, so that lengths inside are
-exact, and only the choice of columns is a discretisation.
+Lengths are in units of the REFERENCE's bounding sphere (paper, Sec. 5), between samples uniform by area.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...neural_fields import InputError, Mesh, Similarity
-from ...neural_fields.backend.files import write_json
 from .raster import cover
 from .surface import components, is_closed, read_surface, sample_points
 
@@ -32,12 +27,11 @@ ViewCounts = Callable[[Mesh, Float64], Int64]
 
 @dataclass(frozen=True)
 class Visible:
-    """Figures of the part of the reference that two photographs or more see; distances as in `Metrics`.
+    """Figures of the part of the reference that two photographs or more see.
 
     Attributes:
         share: of the reference's area.
-        chamfer: mesh → reference of the samples whose nearest one is visible, plus reference → mesh of those that are.
-            None if nothing is.
+        chamfer: as in `Metrics`, of samples that are visible or whose nearest one is; None if nothing is.
         chamfer_floor: the same of another sampling of the reference.
     """
 
@@ -52,27 +46,18 @@ class Metrics:
 
     Attributes:
         chamfer: mean squared distance mesh → reference plus mean squared distance reference → mesh.
-        chamfer_floor: the same between two independent samplings of the reference: what a perfect mesh
-            would score. None for a point cloud.
-        accuracy: the first half of ``chamfer``, mesh → reference.
-        completeness: its second half, reference → mesh.
+        chamfer_floor: the same between two samplings of the reference, the score of a perfect mesh; None for a cloud.
+        accuracy: the first half of ``chamfer``.
+        completeness: its second half.
         hausdorff: the largest squared distance, either way.
-        f_score: harmonic mean of the shares of samples within ``threshold`` of the other surface.
-        threshold: distance (not squared) for ``f_score``.
-        normal_consistency: mean of |n·n'| between samples and their nearest neighbours, over both
-            directions. None for a reference without normals.
-        iou: volume of the intersection over volume of the union. None when the reference is a point
-            cloud, or when a surface has so many holes that inside cannot be told.
-        shell_iou: the paper's "IoU": overlap of the sets of voxels that hold samples.
-        voxel: size of the voxels of ``shell_iou``.
+        f_score: harmonic mean of the shares of samples within ``threshold`` (not squared) of the other surface.
+        normal_consistency: mean of |n·n'| between samples and nearest neighbours, both ways; None without normals.
+        iou: volume of the intersection over that of the union; None for a cloud, or with too many holes.
+        shell_iou: the paper's "IoU": overlap of the sets of voxels, ``voxel`` wide, that hold samples.
         components: connected components of the mesh.
         closed: whether every edge of the mesh has a face on both sides.
-        vertices: vertices of the mesh.
-        faces: faces of the mesh.
-        mean_distance: mean unsquared distance over both directions, in INPUT units.
-        scale: input units per unit.
-        samples: samples on each surface.
-        seed: seed of the samples.
+        mean_distance: mean unsquared distance over both directions, in INPUT units, ``scale`` of which are one unit.
+        samples: on each surface.
         notes: what the reader of the figures should know.
         visible: the same where two photographs or more see the reference; None if that was not asked for.
     """
@@ -108,17 +93,9 @@ def evaluate_files(
     seed: int = 0,
     view_counts: ViewCounts | None = None,
 ) -> Metrics:
-    """``evaluate_surfaces`` on two files; the reference may be a point cloud.
+    """`evaluate_surfaces` of two files; the reference may be a point cloud.
 
-    Args:
-        mesh: the file to judge.
-        reference: that of the truth.
-        samples: see `evaluate_surfaces`.
-        seed: of the samples.
-        view_counts: see `evaluate_surfaces`.
-
-    Raises:
-        InputError: a file cannot be read, or has no faces: the first one, or the second where photographs are counted.
+    Raises an InputError if a file cannot be read or has no faces: the mesh, or the reference with ``view_counts``.
     """
     surface = read_surface(mesh)
     if not len(surface.faces):
@@ -215,22 +192,13 @@ def evaluate_surfaces(
 
 
 def chamfer(a: Float64, b: Float64) -> tuple[float, float]:
-    """The two halves of the squared-L2 Chamfer distance of point sets ``(N, 3)`` and ``(M, 3)``.
-
-    ``mean_a min_b |a − b|²`` and ``mean_b min_a |a − b|²``; the tables give their sum.
-    """
+    """Mean squared distances of ``a`` ``(N, 3)`` to ``b`` ``(M, 3)``, and back; the tables give their sum."""
     ways = _ways(a, b)
     return float(ways.there.mean()), float(ways.back.mean())
 
 
 class _Ways(NamedTuple):
-    """Squared distances between samples of a surface and of the reference.
-
-    Attributes:
-        there: ``(N,)`` of the surface's samples to the reference.
-        nearest: ``(N,)`` which of the reference's samples is next to each of them.
-        back: ``(M,)`` of the reference's samples to the surface.
-    """
+    """Squared distances of samples ``(N,)`` to the reference's, the nearest of these, and the way back ``(M,)``."""
 
     there: Float64
     nearest: Int64
@@ -303,21 +271,11 @@ def format_metrics(metrics: Metrics) -> str:
     return "\n".join([*rows, f"{m.samples:,} samples on each surface, seed {m.seed}", *(f"note: {n}" for n in m.notes)])
 
 
-def write_metrics(path: str | Path, metrics: Metrics) -> None:
-    """Write the figures as JSON, through a temporary file beside the target."""
-    write_json(path, dataclasses.asdict(metrics))
-
-
 class Overlap(NamedTuple):
-    """Volumes, averaged over the three axes, and the share of columns that had to be left out.
+    """Volumes of two meshes, of their intersection and their union, means over the three axes.
 
-    Attributes:
-        first: volume of the first mesh.
-        second: volume of the second.
-        intersection: volume inside both.
-        union: volume inside either.
-        broken: share of the columns that meet a surface but enter and leave it a different number of
-            times; 0 for closed, consistently oriented meshes.
+    ``broken`` is the share of the columns left out because they enter and leave a surface a different number of times;
+    0 for closed, consistently oriented meshes.
     """
 
     first: float
@@ -328,15 +286,10 @@ class Overlap(NamedTuple):
 
 
 def overlap(first: Mesh, second: Mesh, *, columns: int = 512) -> Overlap:
-    """Measure two meshes; inside is where the winding number is not zero.
+    """Volumes inside two meshes in the same coordinates, where the winding number is not zero.
 
-    Args:
-        first: a mesh.
-        second: another, in the same coordinates.
-        columns: along the longest side of the box around both.
-
-    Raises:
-        ValueError: ``columns`` is not positive, or a surface has no faces.
+    Lengths inside are exact along lines of the three axes; the only discretisation is their number, ``columns`` along
+    the longest side of the box around both. Raises a ValueError if that is not positive or a surface has no faces.
     """
     if columns < 1:
         raise ValueError(f"columns={columns}: expected > 0")
@@ -376,10 +329,7 @@ def _crossings(
 
 
 def _inside_lengths(
-    first: tuple[Int64, Float64, NDArray[np.int8]],
-    second: tuple[Int64, Float64, NDArray[np.int8]],
-    *,
-    size: int,
+    first: tuple[Int64, Float64, NDArray[np.int8]], second: tuple[Int64, Float64, NDArray[np.int8]], *, size: int
 ) -> tuple[Float64, int, int]:
     """Total lengths inside first, second, both, either; columns met; columns broken (and left out)."""
     sums = [np.bincount(c, weights=s, minlength=size) for c, _, s in (first, second)]

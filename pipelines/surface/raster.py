@@ -1,7 +1,4 @@
-"""Triangles seen along an axis: which columns of a regular grid each one covers, and where.
-
-One routine serves the volumetric IoU (columns through space) and the pictures (pixels of an image).
-"""
+"""Triangles seen along an axis: which columns of a regular grid each one covers, for volumetric IoU and pictures."""
 
 from __future__ import annotations
 
@@ -17,12 +14,12 @@ Faces = NDArray[np.integer]
 
 
 class Coverage(NamedTuple):
-    """Pairs of a triangle and a column it covers.
+    """Pairs of a triangle and a column that it covers.
 
     Attributes:
         face: ``(K,)`` index of the triangle.
         column: ``(K,)`` index of the column, ``x * ny + y``.
-        weights: ``(K, 3)`` barycentric coordinates of the column's point in the triangle.
+        weights: ``(K, 3)`` barycentric coordinates of the column's point.
         sign: ``(K,)`` +1 where the triangle runs counter-clockwise (its normal points to +z), −1 otherwise.
     """
 
@@ -33,14 +30,13 @@ class Coverage(NamedTuple):
 
 
 class Clipped(NamedTuple):
-    """What is left of triangles cut at a plane; vertex V + k is ``(1 − share[k]) kept[k] + share[k] dropped[k]``.
+    """Triangles cut at a plane; vertex V + k is ``(1 − share[k]) kept[k] + share[k] dropped[k]``.
 
     Attributes:
         faces: ``(F', 3)`` indices of old vertices, and of new ones from V on.
         owner: ``(F',)`` the old triangle that each is a part of.
-        kept: ``(K,)`` old vertex on the near side of the edge that new vertex k cuts.
+        kept: ``(K,)`` old vertex on the near side of the cut edge.
         dropped: ``(K,)`` the one on the far side.
-        share: ``(K,)`` how far from the first to the second the plane is.
     """
 
     faces: Faces
@@ -53,8 +49,7 @@ class Clipped(NamedTuple):
 def clip(height: Float64, faces: Faces) -> Clipped:
     """Cut triangles where ``height`` ``(V,)``, linear over each, is zero, and keep where it is positive.
 
-    A corner cut off leaves a quadrilateral, which becomes two triangles; two corners cut off leave one.
-    Neighbours cut their common edge at exactly the same place.
+    A cut quadrilateral becomes two triangles. Neighbours cut their common edge at exactly the same place.
     """
     positive = height > 0
     count = positive[faces].sum(axis=1)
@@ -85,17 +80,11 @@ def clip(height: Float64, faces: Faces) -> Clipped:
 def cover(
     xy: NDArray[np.floating], faces: Faces, shape: tuple[int, int], *, chunk: int = 1 << 20
 ) -> Iterator[Coverage]:
-    """Yield the columns that triangles cover; column (i, j) is the point (i, j) of the plane.
+    """Yield the columns that triangles ``(F, 3)`` cover; column (i, j) is the point (i, j) of the plane of ``xy``.
 
-    Two triangles with a common edge never both claim or both leave a point on it, because the side of
-    an edge is computed once, from its lower-numbered end, whichever triangle asks. On a closed mesh
-    (with duplicate vertices merged) the signs over each column therefore sum to zero.
-
-    Args:
-        xy: ``(V, 2)`` vertices, in units of the grid.
-        faces: ``(F, 3)`` vertex indices.
-        shape: columns along x and y.
-        chunk: how many pairs to test at a time, of a triangle and a column between its edges: a million take 200 MB.
+    Two triangles never both claim or both leave a point on their common edge, because its side is computed from the
+    edge's lower-numbered end. So on a closed mesh without duplicate vertices, signs sum to zero over each column.
+    ``chunk`` pairs of a triangle and a column are tested at a time: a million take 200 MB.
     """
     corners = xy[faces]  # (F, 3, 2)
     top = np.asarray(shape) - 1
@@ -133,11 +122,10 @@ def _within(count: Int64) -> Int64:
 
 
 def _between(corners: NDArray[np.floating], row: Int64, i: Int64, low: Int64, high: Int64) -> tuple[Int64, Int64]:
-    """Where the line x = ``i`` runs through the triangle ``corners[row]``: the first column to be tested, and how many.
+    """First column to test on the line x = ``i`` through the triangle ``corners[row]``, and how many.
 
-    The two edges that the line crosses bound it. The interval is widened by what the test of a column can be wrong by:
-    on an edge from (x₀, y₀) by (Δx, Δy) its error is a few roundings of |Δx||j − y₀| + |Δy||i − x₀|, and
-    |i − x₀| ≤ |Δx| there, so that in y it is a few roundings of the triangle's height.
+    The interval between the two crossed edges is widened by the error of a column's test: on an edge from (x₀, y₀) by
+    (Δx, Δy) a few roundings of |Δx||j − y₀| + |Δy||i − x₀|, so in y a few roundings of the triangle's height.
     """
     lowest, highest = np.full(len(row), np.inf), np.full(len(row), -np.inf)
     for k in range(3):

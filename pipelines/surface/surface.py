@@ -29,22 +29,14 @@ MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 
 
 def read_surface(path: str | Path) -> Mesh:
-    """Read a mesh, or any cloud that ``datasets.read_cloud`` knows.
-
-    Raises:
-        InputError: the file is missing, damaged, empty or of a kind we do not read.
-    """
+    """Read a mesh, or any cloud that `read_cloud` knows; raises an InputError for a missing, damaged or empty file."""
     return read_described(path)[0]
 
 
 def read_described(path: str | Path) -> tuple[Mesh, str]:
     """`read_surface`, and of a cloud one line about what was read; see `PointCloud`."""
     path = Path(path)
-    mesh = None
-    if path.suffix.lower() in (".glb", ".gltf"):
-        mesh = _load_gltf(path)
-    elif path.suffix.lower() in MESH_SUFFIXES:
-        mesh = _load_mesh(path)
+    mesh = _load_mesh(path) if path.suffix.lower() in MESH_SUFFIXES else None
     if mesh is not None:
         return mesh, ""
     cloud = read_cloud(path)
@@ -52,15 +44,7 @@ def read_described(path: str | Path) -> tuple[Mesh, str]:
 
 
 def read_reference(path: str | Path, *, fix: str = "give a mesh") -> Mesh:
-    """`read_surface` of something to compare with.
-
-    Args:
-        path: a mesh file.
-        fix: what the message advises where there are no faces.
-
-    Raises:
-        InputError: as `read_surface`, or there are no faces.
-    """
+    """`read_surface` of something with faces to compare with; the InputError of a file without ends with ``fix``."""
     surface = read_surface(path)
     if not len(surface.faces):
         raise InputError(f"{path}: has no faces, so there is no surface to compare with; {fix}")
@@ -83,35 +67,21 @@ def _load_mesh(path: Path) -> Mesh | None:
     """The triangles of a file; None where it has no faces."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    cloud, faces = read_mesh(path)
-    if not len(faces):
-        return None
-    colors = None if cloud.colors is None else cloud.colors.astype(np.float64)
-    return _checked(path, Mesh(cloud.points, faces, None, colors))
-
-
-def _load_gltf(path: Path) -> Mesh:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    mesh = read_gltf(path, textures=False)
-    colors = None if mesh.vertex_colors is None else mesh.vertex_colors.astype(np.float64)
-    return _checked(path, Mesh(mesh.vertices, mesh.faces, None, colors))
-
-
-def _checked(path: Path, surface: Mesh) -> Mesh:
-    """The surface, if it is one.
-
-    Raises:
-        InputError: a face names no vertex, a coordinate is not finite, or all vertices coincide.
-    """
-    vertices, faces = surface.vertices, surface.faces
+    if path.suffix.lower() in (".glb", ".gltf"):
+        mesh = read_gltf(path, textures=False)
+        vertices, faces, colors = mesh.vertices, mesh.faces, mesh.vertex_colors
+    else:
+        cloud, faces = read_mesh(path)
+        vertices, colors = cloud.points, cloud.colors
+        if not len(faces):
+            return None
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: a face names vertex {faces.max()}, but there are only {len(vertices)}")
     if not np.isfinite(vertices[np.unique(faces)]).all():
         raise InputError(f"{path}: a vertex has a coordinate that is not a finite number")
     if not np.ptp(vertices[np.unique(faces)], axis=0).any():
         raise InputError(f"{path}: all vertices coincide")
-    return surface
+    return Mesh(vertices, faces, None, None if colors is None else colors.astype(np.float64))
 
 
 def face_normals(mesh: Mesh) -> tuple[Float64, Float64]:
@@ -123,12 +93,9 @@ def face_normals(mesh: Mesh) -> tuple[Float64, Float64]:
 
 
 def sample_points(surface: Mesh, count: int, rng: np.random.Generator) -> tuple[Float64, NDArray[np.floating] | None]:
-    """Points uniform by area ``(count, 3)`` with the normals of their faces.
+    """Points uniform by area ``(count, 3)`` with the normals of their faces; raises ValueError without area.
 
-    Of a cloud, its own points (at most ``count``, chosen at random) with their own normals.
-
-    Raises:
-        ValueError: the surface has no area.
+    Of a cloud, at most ``count`` of its own points, chosen at random, with their own normals.
     """
     if not len(surface.faces):
         chosen = slice(None)
@@ -200,13 +167,7 @@ def keep_largest(mesh: Mesh) -> Mesh:
 
 
 class Supported(NamedTuple):
-    """What `drop_unsupported` leaves.
-
-    Attributes:
-        mesh: the components that rest on points.
-        dropped: how many others there were.
-        area: theirs, as a share of the whole.
-    """
+    """The components that rest on points, the number of others, and their area as a share of the whole."""
 
     mesh: Mesh
     dropped: int
@@ -216,21 +177,14 @@ class Supported(NamedTuple):
 def drop_unsupported(
     mesh: Mesh, points: NDArray[np.floating], *, radius: float | None = None, least: float = 0.05
 ) -> Supported:
-    """Drop the connected components that no input points support: blobs, which nothing was measured of.
+    """Drop the connected components that no input points ``(N, 3)`` support: blobs, where nothing was measured.
 
-    A component is kept if at least the share ``least`` of its area has its corners within ``radius`` of some point, and
-    no less than three points are nearer to it than to others, or at least half of those that so large an area has
-    elsewhere. Where that keeps none, all stay: mesh and points do not belong together, and this is no judge of that.
+    A component is kept if at least the share ``least`` of its area has its corners within ``radius`` (by default
+    `support_radius`) of some point, and at least three points are nearest to it, or half of those that so large an area
+    has elsewhere. If none is kept, all stay: mesh and points do not belong together.
 
-    Args:
-        mesh: with points and radius in the same coordinates.
-        points: ``(N, 3)``, without the outliers.
-        radius: see `support_radius`, which is taken for None.
-        least: in [0, 1]. A part that was measured has nearly all of its area near points, an open scan that the fit
-            closed behind a third or so; a blob has none, or what a stray point or a neighbouring part touches.
-
-    Raises:
-        ValueError: ``radius`` is not positive, or there are no points.
+    A part that was measured has nearly all of its area near points, an open scan that the fit closed behind a third; a
+    blob has none, or what a stray point or a neighbouring part touches. Raises a ValueError without points or radius.
     """
     if len(points) == 0:
         raise ValueError("points: there are none to support anything")
@@ -271,20 +225,12 @@ def without_blobs(
 
 
 def support_radius(points: NDArray[np.floating], *, error: float = 0.0) -> float:
-    """How near its points a measured surface passes: three times their spacing and the fit's error, square to that.
-
-    Args:
-        points: ``(N, 3)``.
-        error: root mean square distance of the surface at them.
-    """
+    """How near its points ``(N, 3)`` a measured surface passes: 3 √(spacing² + error²), of its rms error there."""
     return 3 * float(np.hypot(spacing_of(np.asarray(points, np.float64)), error))
 
 
 def without_voids(mesh: Mesh) -> Mesh:
-    """Drop closed components that are turned inside out: the walls of voids, which no camera outside can see.
-
-    What photographs do not show, training leaves to chance; a void that is really there is lost as well.
-    """
+    """Drop closed components that are turned inside out: walls of voids, which no camera outside can see."""
     component = component_of_faces(mesh)
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     volume = np.bincount(component, weights=(np.cross(a, b) * c).sum(axis=1))
@@ -297,9 +243,9 @@ def without_voids(mesh: Mesh) -> Mesh:
 
 
 def in_region(mesh: Mesh) -> Mesh | None:
-    """The part of a mesh that photographs can show: in the unit sphere, and no void's wall; None where there is none.
+    """The part of a mesh in the unit sphere, without walls of voids; None if there is none.
 
-    Outside the unit sphere, the region of interest, no ray is ever sampled, so that a network may have any sign there.
+    Outside, no ray is ever sampled, so that a network may have any sign there.
     """
     inside = (mesh.vertices**2).sum(axis=1) <= 1
     kept = inside[mesh.faces].all(axis=1)
@@ -307,13 +253,9 @@ def in_region(mesh: Mesh) -> Mesh | None:
 
 
 def trim_distance(mesh: Mesh, points: NDArray[np.floating], distance: float) -> Mesh:
-    """Keep the faces whose three corners are all within ``distance`` of some of ``points`` ``(N, 3)``.
+    """Keep the faces whose corners are all within ``distance`` of some of ``points`` ``(N, 3)``.
 
-    Mesh, points and distance in the same coordinates.
-
-    Raises:
-        ValueError: ``distance`` is not positive.
-        InputError: no face is that close.
+    Raises a ValueError for a distance that is not positive, and an InputError if no face is left.
     """
     if not distance > 0:
         raise ValueError(f"distance={distance}: expected > 0")
@@ -328,12 +270,9 @@ def trim_distance(mesh: Mesh, points: NDArray[np.floating], distance: float) -> 
 
 
 class Support(NamedTuple):
-    """What a surface rests on.
+    """What a surface rests on: points ``(N, 3)`` in the unit sphere, and how near some of them it passes.
 
-    Attributes:
-        points: ``(N, 3)`` in the unit sphere.
-        radius: how near some of them a surface that they support passes.
-        seen: whether they are all that photographs have seen, so that what is further off was seen by none.
+    ``seen``: they are all that photographs have seen, so that what is further off was seen by none.
     """
 
     points: NDArray[np.float64]
@@ -342,11 +281,9 @@ class Support(NamedTuple):
 
 
 def thinned(points: NDArray[np.floating], *, seen_within: float | None = None) -> dict[str, Tensor]:
-    """What is kept in `SUPPORT_FILE` of the points ``(N, 3)`` of a fit, or of what photographs see: one per voxel.
+    """What `SUPPORT_FILE` keeps of unit-sphere points ``(N, 3)``, of a fit or seen by photographs: one per voxel.
 
-    Args:
-        points: in the unit sphere.
-        seen_within: of what photographs see, how far from some point that may be.
+    ``seen_within``: of what photographs see, how far from some point that may be.
     """
     kept = points[voxel_representatives(np.asarray(points, np.float64), SUPPORT_VOXEL)]
     seen = {} if seen_within is None else {"seen_within": torch.tensor(float(np.hypot(seen_within, SUPPORT_VOXEL)))}
@@ -362,15 +299,9 @@ def seen_part(mesh: Mesh, support: Support) -> tuple[Mesh | None, float]:
 
 
 def read_support(field: Path, record: dict[str, Any], level: int) -> Support | None:
-    """What supports a level of the field in a file; None if the file is no run's, or that level is still in training.
+    """What supports a level of the field in a file; None if it is no run's, or that level is still in training.
 
-    Args:
-        field: the checkpoint.
-        record: what ``run.json`` holds.
-        level: counted from 0.
-
-    Raises:
-        InputError: the points are damaged, or of another run.
+    ``record`` is what ``run.json`` holds. Raises an InputError if the points are damaged or of another run.
     """
     path = field.with_name(SUPPORT_FILE)
     stages = record.get("stages", [])

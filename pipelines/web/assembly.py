@@ -45,10 +45,10 @@ LIVE_POLICY = "; connect-src 'self'"
 
 
 def fill_page(header: Mapping[str, Any], data: bytes, *, live: bool = False) -> str:
-    """The page with a header and its bytes in it, and a policy that lets its own script and styles run, and no others.
+    """The page with a header and its bytes, and a policy that lets only its own script and styles run.
 
-    What comes from the run stands in blocks of data, which browsers do not run, and in which no "<" is left.
-    A ``live`` page also asks where it came from for new fields.
+    Data stands in blocks without "<", which browsers do not run. A ``live`` page also fetches new fields from its
+    server.
     """
     scripts = (*SCRIPTS, "main.js", *(("file.js", "live.js") if live else ()))
     script = "\n" + "\n".join(_bare(_source(name)) for name in scripts)
@@ -68,18 +68,10 @@ def fill_page(header: Mapping[str, Any], data: bytes, *, live: bool = False) -> 
 
 
 def write_folder(out: Path, header: Mapping[str, Any], data: bytes) -> None:
-    """Write what another page needs to show a field, and the page of its own beside it.
+    """Write what another page needs to show a field, into a folder that is made if needed; raises InputError.
 
-    ``field.bin`` is a `field_file`, ``mplicits-field.js`` an ES module that defines the element ``<mplicits-field>``;
-    its types, and a README that says how to use it, come with it.
-
-    Args:
-        out: the folder, which is made if it is not there.
-        header: of the page.
-        data: its bytes.
-
-    Raises:
-        InputError: a file cannot be written.
+    ``field.bin`` is a `field_file`; ``mplicits-field.js`` is an ES module that defines the element
+    ``<mplicits-field>``. Its types, a README and a page of its own come with it.
     """
     out.mkdir(parents=True, exist_ok=True)
     title = " ".join(str(header["title"]).split())

@@ -35,10 +35,10 @@ class WebOptions:
 
     Attributes:
         levels: how many levels, from the coarsest on; None is all.
-        time: the moment, of a run that moves; None shows all of its moments.
-        colors: whether the colours of the run's texture are in it, if it has one and does not move.
+        time: the moment, for a run that moves; None shows all moments.
+        colors: whether it has the colours of the run's texture; not while it moves.
         float32: whether the weights are kept as they are; else they are rounded to `BITS` bits.
-        cloud: a cloud beside the field, coloured by its distance; "auto" is what the run was fitted to, if it is found.
+        cloud: a cloud beside the field, coloured by its distance; "auto" is the fitted one, if it is found.
         up: the axis that points up, "y" or "z".
         title: of the page; None is the name of the run or file.
     """
@@ -57,9 +57,8 @@ class WebPage:
     """A page that was written.
 
     Attributes:
-        size: of the file, or of what the element fetches: ``field.bin`` and its module; in bytes.
-        levels: of the field that it traces; 0 if it shows clouds or meshes alone.
-        colored: whether it has colours.
+        size: bytes of the file, or of ``field.bin`` and its module.
+        levels: of the field that it traces; 0 for clouds or meshes alone.
         triangles: of the mesh between which rays are sought, or of the meshes that it shows.
         rounding: what rounding the weights has changed, for each level; empty if they are exact.
     """
@@ -72,13 +71,7 @@ class WebPage:
 
 
 class Packed(NamedTuple):
-    """What a page carries.
-
-    Attributes:
-        header: describes what is shown, and where it is among the bytes.
-        data: deflated bytes.
-        page: figures of it; the size is not known yet.
-    """
+    """What a page carries: a header that describes the deflated bytes, these, and figures, but for the size."""
 
     header: dict[str, Any]
     data: bytes
@@ -86,13 +79,9 @@ class Packed(NamedTuple):
 
 
 def web_run(
-    source: str | Path,
-    out: str | Path,
-    options: WebOptions | None = None,
-    *,
-    say: Callable[[str], None] | None = None,
+    source: str | Path, out: str | Path, options: WebOptions | None = None, *, say: Callable[[str], None] | None = None
 ) -> WebPage:
-    """Write a page that shows a run, a mesh or a cloud, and needs nothing but itself; or a folder for another page.
+    """Write a page that shows a run, a mesh or a cloud and needs nothing else, or a folder for another page.
 
     Args:
         source: run directory, .safetensors file, mesh or cloud.
@@ -122,15 +111,7 @@ def web_run(
 
 
 def pack(source: str | Path, options: WebOptions | None = None) -> Packed:
-    """Pack a run, a mesh or a cloud.
-
-    Args:
-        source: run directory, .safetensors file, mesh or cloud.
-        options: what to show.
-
-    Raises:
-        InputError: it cannot be read, has no surface, or an option does not go with it.
-    """
+    """Pack a run, a mesh or a cloud; raises an InputError if it cannot be read or an option does not go with it."""
     options = options or WebOptions()
     if not is_field(source):
         for name in ("levels", "time", "cloud"):
@@ -170,17 +151,9 @@ def pack_field(
 ) -> Packed:
     """Pack a field: levels of SIRENs as networks that the page traces, any other as meshes of its levels.
 
-    Args:
-        field: three-dimensional, or levels of SIRENs in space and time.
-        similarity: from input coordinates to the field's.
-        options: what to show.
-        name: the title, if ``options`` has none.
-        texture: colours of the surface.
-        cloud: a file of points to show beside it.
-
-    Raises:
-        NoSurfaceError: there is no surface.
-        InputError: it moves and no shader traces it, or the cloud cannot be read.
+    It is three-dimensional, or levels of SIRENs in space and time. ``texture`` has its colours, ``cloud`` is a file of
+    points to show beside it. Raises a NoSurfaceError, or an InputError if it moves and no shader traces it, or the
+    cloud cannot be read.
     """
     options = options or WebOptions()
     shapes = [] if cloud is None else [distance_cloud(cloud, field, similarity)]
@@ -226,14 +199,7 @@ def pack_field(
 def pack_shapes(
     shapes: Sequence[Shape], similarity: Similarity, options: WebOptions | None = None, *, name: str
 ) -> Packed:
-    """Pack clouds and meshes, without a field.
-
-    Args:
-        shapes: at least one, in unit-sphere coordinates.
-        similarity: from input coordinates to those.
-        options: ``up`` and ``title`` are used.
-        name: the title, if ``options`` has none.
-    """
+    """Pack clouds and meshes in unit-sphere coordinates, without a field; ``up`` and ``title`` of the options count."""
     options = options or WebOptions()
     outline = np.concatenate([shape.vertices for shape in shapes if not shape.hidden])
     header = {
@@ -301,11 +267,7 @@ def _coarse(field: Field, levels: int) -> Field:
 
 
 def _outlines(stills: list[Field]) -> list[tuple[Field, NDArray[np.floating]]]:
-    """The moments that have a surface, and points of it.
-
-    Raises:
-        NoSurfaceError: none has one.
-    """
+    """The moments that have a surface, and points of it; raises a NoSurfaceError if none has."""
     found: list[tuple[Field, NDArray[np.floating]]] = []
     missing: NoSurfaceError | None = None
     for still in stills:

@@ -1,7 +1,6 @@
-"""Access control of a local server: a token, the origin, and the names of this machine.
+"""Access control of a local server, which every user and every visited page of a machine could reach.
 
-A server on 127.0.0.1 is open to every user of the machine and, through their browsers, to every page that they visit.
-So each request is checked three times: its Host header, its Origin header and its token.
+Each request is checked by its Host header, its Origin header and its token.
 """
 
 from __future__ import annotations
@@ -30,13 +29,7 @@ ASKING = """<!doctype html><meta charset="utf-8"><title>mplicits</title>
 
 
 class Verdict(NamedTuple):
-    """The decision about a request.
-
-    Attributes:
-        status: 200 admits it; any other is the answer to it.
-        body: the answer; empty where it is admitted.
-        headers: to be sent along, whatever the status.
-    """
+    """The decision about a request: 200 admits it, any other status and the body answer it; headers are always sent."""
 
     status: HTTPStatus
     body: str
@@ -49,17 +42,10 @@ class Verdict(NamedTuple):
 
 
 class Gate:
-    """The checks of one server.
-
-    Args:
-        host: the address that it listens on.
-        port: its port.
-        token: the end of its address; random if it is None.
+    """The checks of one server, by its address, its port and its token, which is random if it is None.
 
     Example:
         >>> gate = Gate("127.0.0.1", 8080, token="secret")
-        >>> gate.url
-        'http://127.0.0.1:8080/?token=secret'
         >>> gate.admit("/", {"Host": "127.0.0.1:8080"}).status.value
         403
         >>> gate.admit("/?token=secret", {"Host": "127.0.0.1:8080"}).headers["Set-Cookie"]
@@ -77,11 +63,9 @@ class Gate:
         return f"http://{f'[{local}]' if ':' in local else local}:{self.port}/?token={self.token}"
 
     def admit(self, path: str, headers: Mapping[str, str]) -> Verdict:
-        """Decide about a request. A token in the address is answered with a cookie, which the page's own requests send.
+        """Decide about a request by its path, with query, and its headers.
 
-        Args:
-            path: with what follows the question mark.
-            headers: of the request, by their usual names.
+        A token in the address is answered with a cookie, which the page's own requests send.
         """
         host, origin = headers.get("Host", ""), headers.get("Origin")
         if _is_loopback(self.host) and not _is_loopback(_name_of(host)):

@@ -18,17 +18,9 @@ from .shapes import field_shapes
 
 
 class Pairs:
-    """Landmarks of two runs, kept in a file while there are any.
+    """Landmarks of two runs that do not move, kept in the file ``path`` while there are any.
 
-    The first run stands about (−½, 0, 0) at half its size, the second about (½, 0, 0), each as the mesh of its finest
-    level.
-
-    Args:
-        runs: run directories or .safetensors files.
-        path: the file; pairs that it has already are kept.
-
-    Raises:
-        InputError: there is no such run, one moves or has no surface, or the file holds no landmarks.
+    The page shows the meshes of the finest levels at half size, about (−½, 0, 0) and (½, 0, 0). Raises InputError.
     """
 
     def __init__(self, runs: Sequence[str | Path], path: str | Path, *, up: str = "y") -> None:
@@ -60,9 +52,7 @@ class Pairs:
     def keep(self, pairs: Any) -> None:
         """Write pairs ``(P, 2, 3)`` of places in the scene, in the input coordinates of either run.
 
-        Raises:
-            ValueError: they are none.
-            InputError: the file cannot be written.
+        Raises a ValueError for anything else, and an InputError if the file cannot be written.
         """
         try:
             places = np.array(pairs, np.float64)

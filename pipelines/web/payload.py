@@ -24,11 +24,10 @@ class Layer:
     """One layer of a network, as the page gets it.
 
     Attributes:
-        weight: ``(out, in)`` float32; of a sine layer in turns.
-        bias: ``(out,)`` float32, likewise.
-        codes: ``(out, in)`` int32 in [−2^(bits−1) + 1, 2^(bits−1) − 1] if the weights are rounded, else None.
-        scale: ``(out,)`` float32; a rounded weight is its code times the scale of its row.
-        rate: ``(out,)`` float32, of the first layer of a network that moves: how fast its bias grows with time.
+        weight: ``(out, in)``; of a sine layer in turns, as ``bias`` ``(out,)``.
+        codes: ``(out, in)`` in [−2^(bits−1) + 1, 2^(bits−1) − 1] if the weights are rounded, else None.
+        scale: ``(out,)``; a rounded weight is its code times the scale of its row.
+        rate: ``(out,)`` of the first layer of a network that moves: growth of its bias with time.
     """
 
     weight: NDArray[np.float32]
@@ -40,12 +39,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Rounding:
-    """What rounding the weights has changed at the points of a surface, of one level.
-
-    Attributes:
-        value: greatest change of the distance, in units of the field.
-        angle: greatest turn of a normal, in degrees.
-    """
+    """The most that rounding has changed on a surface: distances in units of the field, normals in degrees."""
 
     value: float
     angle: float
@@ -59,15 +53,10 @@ def shader_levels(field: Field) -> list[Siren] | None:
 
 
 def network_layers(network: Siren, bits: int | None, *, channels: int = 1) -> list[Layer]:
-    """The layers of a network, sine layers in turns, the output last.
+    """The layers of a network, sine layers in turns, the output last, of which ``channels`` are kept.
 
-    Weights between sine layers, nearly all there are, are rounded to ``bits`` bits: code times the scale of its row.
-    First layer, output and biases stay as they are.
-
-    Args:
-        network: which; of one in space and time, the first layer's weights of time become its `Layer.rate`.
-        bits: of a rounded weight; None rounds none.
-        channels: outputs that the page asks for.
+    Weights between sine layers, nearly all there are, are rounded to ``bits`` bits (None: not at all): code times the
+    scale of its row. First layer, output and biases stay. In space and time, weights of time become `Layer.rate`.
     """
     numbers = [part.detach().cpu().double().numpy() for part in network.folded()]
     pairs = list(zip(numbers[0::2], numbers[1::2], strict=True))
@@ -135,9 +124,7 @@ PAIR, SINGLE = 13, 6  # bits
 class Payload:
     """Named arrays one behind the other, each beginning at a multiple of four bytes, little-endian.
 
-    Attributes:
-        blocks: name → kind ("f4", "u2", "u4" or "i" or "d" and a number of bits), count of its numbers and first byte.
-        parts: the bytes.
+    ``blocks``: name → kind ("f4", "u2", "u4", or "i" or "d" and a number of bits), number of numbers, first byte.
     """
 
     blocks: dict[str, list[Any]] = field(default_factory=dict)
@@ -145,13 +132,7 @@ class Payload:
     size: int = 0
 
     def add(self, name: str, numbers: NDArray[Any], kind: str) -> None:
-        """Append an array; its shape is not kept.
-
-        Args:
-            name: of the block.
-            numbers: any shape.
-            kind: "f4", "u2", "u4", or e.g. "i13": signed codes of 13 bits, see `pack_codes`.
-        """
+        """Append an array, without its shape, as "f4", "u2", "u4", or e.g. "i13": signed codes of 13 bits."""
         flat = np.ascontiguousarray(numbers).reshape(-1)
         data = pack_codes(flat, int(kind[1:])) if kind[0] == "i" else flat.astype(f"<{kind}").tobytes()
         data += b"\0" * (-len(data) % 4)
@@ -167,11 +148,7 @@ class Payload:
         self.blocks[name][0] = f"d{bits}"
 
     def add_network(self, name: str, layers: list[Layer]) -> dict[str, Any]:
-        """Append the layers of a network.
-
-        Returns:
-            What the page has to know of it: its name, width and depth.
-        """
+        """Append the layers of a network; returns what the page has to know: its name, width and depth."""
         for index, layer in enumerate(layers):
             key = f"{name}.{index}"
             self.add(f"{key}.bias", layer.bias, "f4")
@@ -198,10 +175,10 @@ def deflated(data: bytes) -> bytes:
 
 
 def text_of(data: bytes) -> str:
-    """Bytes as letters of a page: 16 in 13 bytes, where base64 takes 16 for 12.
+    """Bytes as letters of a page: 16 for 13 bytes, where base64 takes 16 for 12.
 
-    The bits, lowest of each byte first, go in groups of 13 into two of the 91 letters, the lower digit first. The last
-    group is one letter if it has 6 bits or fewer, so that the number of letters tells the number of bytes.
+    Groups of 13 bits, lowest first, become two of the 91 letters, the lower digit first. The last group is one letter
+    if it has 6 bits or fewer, so the number of letters gives the number of bytes.
     """
     bits = np.unpackbits(np.frombuffer(data, np.uint8), bitorder="little").astype(np.int64)
     rest = len(bits) % PAIR
@@ -213,8 +190,8 @@ def text_of(data: bytes) -> str:
 def pack_codes(codes: NDArray[np.integer], bits: int) -> bytes:
     """Signed numbers ``(N,)`` in two's complement of ``bits`` bits, in two parts that deflate better than one.
 
-    First the upper eight bits of each, fewer if there are no more: small numbers are frequent, and these bits tell.
-    Then the lower ones, lowest bit first, without gaps.
+    First the upper eight bits of each, or fewer if there are no more, then the lower ones, lowest bit first, without
+    gaps.
     """
     whole = codes.astype(np.int64) & (2**bits - 1)
     low = max(0, bits - 8)

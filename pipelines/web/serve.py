@@ -25,9 +25,7 @@ PORTS = range(8080, 8180)  # of which the first free one is taken
 
 
 class PageServer:
-    """Serves a page until it is closed; a context manager.
-
-    Only clients with the token of its `url` are admitted, and no page of another origin (`Gate`).
+    """Serves what ``pack`` makes until it is closed, as a context manager; only to clients with the token of its `url`.
 
     Args:
         pack: makes what the page shows.
@@ -66,11 +64,7 @@ class PageServer:
         return len(self.clients)
 
     def update(self) -> None:
-        """Show the newest version to all browsers, from where they stand.
-
-        Raises:
-            InputError: see `PageServer`.
-        """
+        """Show the newest version to all browsers, from the same point of view; raises what ``pack`` raises."""
         self.packed = self._pack()
 
     def close(self) -> None:

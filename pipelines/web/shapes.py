@@ -23,15 +23,10 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Shape:
-    """Points or triangles in the coordinates of a page.
+    """Points or triangles in the coordinates of a page; ``faces`` are None for points.
 
-    Attributes:
-        name: of its box in the panel.
-        vertices: ``(V, 3)``.
-        faces: ``(F, 3)``; None for points.
-        normals: ``(V, 3)`` unit normals; None: those of the faces, or towards the eye.
-        colors: ``(V, 3)`` display RGB in [0, 1]; None is the colour of clay.
-        hidden: whether it is hidden at first.
+    Without ``normals`` ``(V, 3)`` those of the faces are taken, or those towards the eye; without ``colors``, display
+    RGB in [0, 1], clay. ``hidden``: at first.
     """
 
     name: str
@@ -43,10 +38,9 @@ class Shape:
 
 
 def add_shape(payload: Payload, shape: Shape, index: int) -> dict[str, Any]:
-    """Append the arrays of a shape to a payload; positions are rounded to 1/65535 of its box, normals to 7 bits.
+    """Append a shape's arrays to a payload, and return its description for the header.
 
-    Returns:
-        Its description for the page's header.
+    Positions are rounded to 1/65535 of its box, normals to 7 bits.
     """
     low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
     extent = np.where(high > low, high - low, 1.0)
@@ -70,13 +64,9 @@ def add_shape(payload: Payload, shape: Shape, index: int) -> dict[str, Any]:
 
 
 def read_shape(file: Path) -> tuple[Shape, Similarity]:
-    """The mesh or the cloud of a file in its unit sphere, and the way there.
+    """The mesh or cloud of a file in its unit sphere, and the similarity to that; raises InputError.
 
-    A texture is sampled at the corners of the faces. Of a large cloud at most 200,000 are taken,
-    evenly: more make browsers slow.
-
-    Raises:
-        InputError: it cannot be read, or has no extent.
+    A texture is sampled at the corners of faces. At most 200,000 points are taken, evenly: more make browsers slow.
     """
     surface = read_painted(file)
     faces, normals, colors = surface.faces, None, None
@@ -100,16 +90,7 @@ def read_shape(file: Path) -> tuple[Shape, Similarity]:
 
 @torch.no_grad()
 def distance_cloud(file: Path, field: Field, similarity: Similarity) -> Shape:
-    """A cloud, coloured by its distance to a field's surface; hidden at first.
-
-    Args:
-        file: of the cloud.
-        field: three-dimensional.
-        similarity: from input coordinates to the field's.
-
-    Raises:
-        InputError: see `read_shape`.
-    """
+    """A cloud coloured by its distance to a field's surface; hidden at first. Raises InputError."""
     cloud, own = read_shape(file)
     vertices = similarity.to_unit(own.to_input(cloud.vertices))
     distance = field.value(torch.from_numpy(vertices).to(field.like)).abs().float().cpu()
@@ -121,16 +102,7 @@ def distance_cloud(file: Path, field: Field, similarity: Similarity) -> Shape:
 
 @torch.no_grad()
 def field_shapes(field: Field, texture: TextureField | None = None, *, resolution: int = 160) -> list[Shape]:
-    """Meshes of the levels of a field that no shader traces; the finest is shown first.
-
-    Args:
-        field: three-dimensional.
-        texture: colours of its surface.
-        resolution: cells along the box.
-
-    Raises:
-        InputError: the finest level has no surface.
-    """
+    """Meshes of the levels of a field that no shader traces, the finest visible; raises InputError without one."""
     shapes = []
     for level in range(field.num_levels):
         try:

@@ -1,7 +1,6 @@
-"""A coarse mesh around level 0's band: where the rays of a page begin and end.
+"""The mesh between which a page's rays begin and end: it holds the surface and the band of level 0 around it.
 
-All of the surface, and all of the band around it, lies inside. Outside there is nothing to be found, so a pixel
-whose ray misses the mesh costs no evaluation, and others begin a few steps from the surface.
+A pixel whose ray misses the mesh costs no evaluation. For a surface that moves, it holds the bands of every moment.
 """
 
 from __future__ import annotations
@@ -32,13 +31,7 @@ GRID = 1023
 def shell_mesh(field: Field, *, cells: int = CELLS) -> Mesh:
     """The surface f_0 = δ_0 + `ROOM` cells, closed by a ball a little larger than that in which rays are traced.
 
-    Args:
-        field: with levels; where it has one only, δ_0 counts as 0.
-        cells: along the box.
-
-    Raises:
-        NoSurfaceError: level 0 has no such surface.
-        ValueError: see `extract_mesh`.
+    δ_0 is 0 for a field of one level. Raises a NoSurfaceError if level 0 has no such surface.
     """
     delta = float(field.deltas[0]) if field.num_levels > 1 else 0.0
     half = BOUNDING_RADIUS * (1 + 6 / cells)
@@ -57,17 +50,11 @@ def shell_mesh(field: Field, *, cells: int = CELLS) -> Mesh:
 
 @torch.no_grad()
 def surface_reach(field: Field) -> list[list[float]]:
-    """How far from zero a coarser level is on the surface of a finer one; rays look there alone for finer levels.
+    """How far from zero coarser levels are on the surface of a finer one; rays look for finer levels only there.
 
-    A band is as wide as training wanted it; the surface lies in its inner part,
+        reach[l][j] = min(δ_j, `MARGIN` · max |f_j(x)| over the corners x of the meshes of levels j < k ≤ l)
 
-        reach[l][j] = min(δ_j, `MARGIN` · max |f_j(x)| over the corners x of the meshes of levels j < k ≤ l).
-
-    Returns:
-        For each level l the reaches of levels 0 … l − 1.
-
-    Raises:
-        NoSurfaceError: a level has no surface.
+    for each level l and each j < l. Raises a NoSurfaceError if a level has no surface.
     """
     found: list[list[float]] = [[]]
     for level in range(1, field.num_levels):
@@ -86,18 +73,10 @@ CELL = 2 * BOUNDING_RADIUS / CELLS
 
 
 class Swept(Field):
-    """The least value of all moments of a field that moves, less what lies between them.
+    """The least value of all moments of a field that moves, less what may lie between them.
 
-    With moments t_k,
-
-        f(x) = min_k f(x, t_k) − ½ Δt s,  Δt = t_(k+1) − t_k,
-
-    which is no more than f(x, t) at any t, if no value changes faster than s. So its offset surfaces hold those of
-    every moment. There are so many moments that ½ Δt s is at most half a cell of the mesh, and at most 65.
-
-    Args:
-        field: that moves.
-        speed: s, in units of the field for all the time from 0 to 1; see `fastest_change`.
+    With moments t_k, f(x) = min_k f(x, t_k) − ½ Δt s ≤ f(x, t) at any t, if no value changes faster than s = ``speed``
+    (see `fastest_change`). There are as many moments as make ½ Δt s at most half a cell of the mesh, and at most 65.
     """
 
     def __init__(self, field: SpaceTimeSDF, speed: float) -> None:
@@ -131,10 +110,7 @@ class Swept(Field):
 
 @torch.no_grad()
 def fastest_change(field: SpaceTimeSDF) -> float:
-    """The greatest |∂f_0/∂t| near level 0's band, at `LATTICE`³ places and `TIMES` times.
-
-    It is a measurement and no bound of the field: what moves faster between the places of the lattice is not seen.
-    """
+    """The greatest |∂f_0/∂t| near level 0's band, at `LATTICE`³ places and `TIMES` times: measured, not a bound."""
     line = torch.linspace(-BOUNDING_RADIUS, BOUNDING_RADIUS, LATTICE, dtype=field.like.dtype, device=field.like.device)
     places = torch.cartesian_prod(line, line, line)
     places = places[places.norm(dim=-1) <= BOUNDING_RADIUS]
@@ -156,9 +132,5 @@ def band_reach(field: Field) -> list[list[float]]:
 
 
 def swept_shell(field: SpaceTimeSDF) -> Mesh:
-    """A mesh around the bands of all moments; see `shell_mesh` and `Swept`.
-
-    Raises:
-        NoSurfaceError: there is no moment with a surface.
-    """
+    """A mesh around the bands of all moments (`shell_mesh` of `Swept`); raises NoSurfaceError."""
     return shell_mesh(Swept(field, fastest_change(field)).requires_grad_(False))

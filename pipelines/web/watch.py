@@ -8,39 +8,29 @@ from pathlib import Path
 
 from ...neural_fields import InputError
 from ..training.folder import FIELD_FILE
-from .export import WebOptions, pack
+from .export import pack
 from .serve import PageServer
 
 
 class Watcher:
-    """Shows what a training writes into its run directory; use it as a context manager around the training.
+    """Shows the checkpoints of a training at ``run``, as a context manager around it.
 
-    A thread of its own looks for a new checkpoint once a second, and makes a page of it if a browser is connected:
-    nothing is evaluated while nobody looks. The page begins with the first checkpoint. Whatever goes wrong in it is
-    said once, and leaves the training alone.
-
-    Args:
-        run: directory of the run, or its .safetensors file.
-        options: what is shown.
-        server: that shows the run already; it is closed at the end.
-        resume: whether a field that is there already is of this run, and to be shown.
-        port: the server's, or None for the first free one.
-        say: told where to look, and what went wrong.
-        look_every: seconds between two looks.
+    A thread looks for a new checkpoint every ``look_every`` seconds, and packs it if a browser is connected. The page
+    begins with the first one, or with a field that is there already if ``resume``; a ``server`` shows the run already,
+    and is closed at the end. ``say`` is called with the address, and once with an error, which leaves the training
+    alone.
     """
 
     def __init__(
         self,
         run: Path,
-        options: WebOptions | None = None,
         *,
         server: PageServer | None = None,
         resume: bool = False,
-        port: int | None = None,
         say: Callable[[str], object] = print,
         look_every: float = 1.0,
     ) -> None:
-        self.run, self.options, self.port, self.say = run, options, port, say
+        self.run, self.say = run, say
         self.server = server
         self.shown = 0  # how many checkpoints were shown
         self._every, self._seen = look_every, None if resume and server is None else self._state()
@@ -79,13 +69,11 @@ class Watcher:
             return
         try:
             if self.server is None:
-                self.server = PageServer(lambda: pack(self.run, self.options), port=self.port)
+                self.server = PageServer(lambda: pack(self.run))
                 self.say(f"--watch: open {self.server.url} in a browser")
             else:
                 self.server.update()
-        except InputError as error:
-            if self.server is None and self.port is not None and "--port" in str(error):
-                raise
+        except InputError:
             return  # replaced or removed just now, or without a surface yet: there will be another
         self._seen = state
         self.shown += 1

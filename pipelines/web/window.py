@@ -16,11 +16,7 @@ from .serve import PageServer
 
 
 class Frame(NamedTuple):
-    """A page in a notebook's cell.
-
-    Attributes:
-        page: HTML.
-    """
+    """A page, as HTML, in a notebook's cell."""
 
     page: str
 
@@ -30,12 +26,7 @@ class Frame(NamedTuple):
 
 
 def show(shape: WorldField, *, up: str = "y", block: bool = True, browser: bool = True) -> Any:
-    """See `WorldField.show`.
-
-    Raises:
-        NoSurfaceError: there is no surface.
-        InputError: no port is free.
-    """
+    """See `WorldField.show`; raises NoSurfaceError, or an InputError if no port is free."""
     packed = pack_field(shape.field, shape.similarity, WebOptions(up=up))
     if in_notebook():
         return Frame(fill_page(packed.header, packed.data))
@@ -57,13 +48,7 @@ def in_notebook() -> bool:
 
 
 def until_closed(clients: Callable[[], int], *, look: float = 0.5, gone: float = 5.0) -> None:
-    """Wait until a browser has come and all have left again, or for Ctrl-C.
-
-    Args:
-        clients: the number of browsers.
-        look: seconds between two looks.
-        gone: seconds without a browser; a page that is loaded anew leaves for a moment.
-    """
+    """Wait until a browser has come and none is left for ``gone`` seconds (a reload leaves briefly), or Ctrl-C."""
     seen: float | None = None
     try:
         while seen is None or time.monotonic() - seen < gone:

@@ -74,11 +74,3 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert main([*words, "--json", str(tmp_path / "kernels.json")]) == 0
     assert "of bound" in (tmp_path / "kernels.json").read_text()
     assert json.loads((tmp_path / "kernels.json").read_text())
-
-
-def test_where_the_kernels_cannot_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mplicits.neural_fields import InputError
-
-    monkeypatch.setenv("MPLICITS_KERNELS", "off")
-    with pytest.raises(InputError, match="cannot run here: MPLICITS_KERNELS=off"):
-        KernelsBench(sizes=((16, 1),)).rows(tmp_path / "out")

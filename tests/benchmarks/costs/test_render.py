@@ -5,14 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 from mplicits.datasets import look_at, sample_sphere, write_cloud_ply
-from mplicits.neural_fields import InputError, Plane, Sphere, load_field
+from mplicits.neural_fields import Sphere, load_field
 from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.training.settings import FitConfig
 
 from benchmarks.cli import main
-from benchmarks.costs.render import NETWORKS, RenderBench, RenderRow, naive_view
+from benchmarks.costs.render import RenderBench, RenderRow, naive_view
 from benchmarks.costs.render_truth import Truth
-from benchmarks.harness.report import as_text
 
 SMALL = {
     "400x4": ((24, 2, 8.0, 300, 5e-3),),
@@ -71,27 +70,6 @@ def test_coarse_levels_carry_the_trace(bench):
 
 
 @pytest.mark.slow
-def test_ratios_and_format(bench):
-    rows, *_ = bench
-    base, coarse = rows[:2]
-    assert base.speedup == 1
-    assert coarse.speedup == pytest.approx(base.seconds / coarse.seconds)
-    text = as_text(*RenderBench(shapes=[], config=CONFIG).tables(rows, sgemm=1e9))
-    assert "ball adaptive (128,2)▷(256,2)▷(400,2) NM" in text
-    assert " 9.5 " in text
-    assert len(text.splitlines()) == 3 + len(rows)
-
-
-def test_the_networks_are_the_papers():
-    sizes = {name: [(width, depth) for width, depth, *_ in levels] for name, levels in NETWORKS.items()}
-    assert sizes == {
-        "400x4": [(400, 4)],
-        "128x2_256x2_400x2": [(128, 2), (256, 2), (400, 2)],
-        "128x2_400x2": [(128, 2), (400, 2)],
-    }
-
-
-@pytest.mark.slow
 def test_the_naive_tracer_sees_the_same(bench):
     files = (bench[2] / "out" / "runs").glob("ball-*/field.safetensors")
     field = next(one for file in files if (one := load_field(file).field).num_levels == 3)
@@ -127,9 +105,3 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys):
     assert main(["render", str(tmp_path / "no.ply"), "-o", str(tmp_path / "bench")]) == 2
     assert "no.ply: no such file" in capsys.readouterr().err
     assert not (tmp_path / "bench").exists()
-
-
-def test_a_fit_without_a_surface_says_so():
-    truth = Truth({"nothing": Plane(normal=(0.0, 0.0, 1.0), offset=5.0)}, report=lambda _: None)
-    with pytest.raises(InputError, match="nothing: the fit has no surface"):
-        truth.outline("nothing")

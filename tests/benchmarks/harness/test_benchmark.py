@@ -15,7 +15,7 @@ from mplicits.pipelines.training.trainer import Progress
 
 from benchmarks.harness import run
 from benchmarks.harness.benchmark import Benchmark, Part, from_figures, one_of_each, write_results
-from benchmarks.harness.cells import Catalogue, Workplace
+from benchmarks.harness.cells import Catalogue
 from benchmarks.harness.report import as_text
 from benchmarks.harness.run import run_cell, run_cells
 from benchmarks.harness.tables import Column, Table, tabulated
@@ -141,12 +141,6 @@ def test_two_of_one_name() -> None:
     one_of_each(["a", "b"], "meshes")
     with pytest.raises(InputError, match="b: two of the meshes are called that; rename one of them"):
         one_of_each(["a", "b", "b"], "meshes")
-
-
-def test_a_part_that_was_never_asked_for(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="there is none; did you mean 'squares'"):
-        run_cell(Part("square", "x"), tmp_path, Catalogue([Squares(edges=[])]))
-    assert Workplace(tmp_path, "k").run() == tmp_path / "runs" / "k"
 
 
 def test_the_time_left_counts_what_is_under_way_as_half_done(monkeypatch: pytest.MonkeyPatch) -> None:

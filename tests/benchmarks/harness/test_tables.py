@@ -13,17 +13,13 @@ from benchmarks.harness.report import (
     as_csv,
     as_dict,
     as_markdown,
-    as_page,
     from_dict,
     section_as_dict,
     section_from_dict,
-    with_missing,
 )
-from benchmarks.harness.tables import Column, Row, Table, mean, median, ratio
-from benchmarks.paper.cells import printed_name, select
+from benchmarks.harness.tables import Column, Row, Table
 from benchmarks.paper.comparison import banf_tables, comparison_tables, noise_plots, noise_tables, poisson_tables
 from benchmarks.paper.published import BANF, COMPARISON, NOISE
-from benchmarks.paper.robustness import delta_tables, outlier_plots, outlier_tables, shortened, undertrained_tables
 
 
 def record(shape, method, chamfers, *, iou=0.9, deltas=(), **cell):
@@ -154,74 +150,6 @@ def test_banf() -> None:
     assert row.published[5] == pytest.approx(7.3, abs=0.05)  # as the paper prints it
 
 
-def test_outliers() -> None:
-    records = [
-        record("lucy", "ours", {"Ours coarse": 1.0, "Ours fine": 1e-5}, iou=0.95, outliers=0.01),
-        record("lucy", "poisson", {"Screened Poisson": 2e-3}, iou=0.1, outliers=0.01),
-        record("spot", "ours", {"Ours fine": 2e-5}, iou=0.93, outliers=0.01),
-        record("spot", "ours", {"Ours fine": 4e-5}, iou=0.5, outliers=0.05),
-        record("spot", "ours", {"Ours fine": 3e-5}, iou=0.7, flipped=0.1),
-    ]
-    table, flipped = outlier_tables(records)
-    rows = rows_of(table)
-    assert list(rows) == [f"{shape} {share} %" for shape in ("lucy", "spot") for share in ("0.1", "1", "5")]
-    assert rows["lucy 1 %"]["ours IoU"] == 0.95
-    assert rows["lucy 1 %"]["SPSR IoU"] == 0.1
-    assert rows["lucy 1 %"]["SPSR (trim) IoU"] is None
-    assert rows["lucy 1 %"]["ours CD"] == 1e-5
-    assert rows["lucy 0.1 %"]["ours IoU"] is None
-    by_name = {row.name: row.published for row in table.rows}
-    assert by_name["lucy 1 %"] == (0.002, 0.004, 0.938, None, None, None, None)
-    assert by_name["lucy 5 %"] is None
-    assert by_name["spot 1 %"] is None
-    assert "Lowest IoU of ours at 1 %: 0.930, of spot." in table.notes
-    assert rows_of(flipped) == {
-        "spot": {"ours IoU": 0.7, "SPSR IoU": None, "ours CD": 3e-5, "SPSR CD": None, "ours parts": 3}
-    }
-    (plot,) = outlier_plots(records)
-    assert plot.series == (Series("lucy", (None, 1e-5, None)), Series("spot", (None, 2e-5, 4e-5)))
-
-
-def test_undertrained() -> None:
-    assert shortened((100, 40, 40), 1.0) == ()
-    records = [
-        record("armadillo", "ours", {"Ours fine": 4e-5}, deltas=[0.4], overrides={"steps": [25, 40, 40]}),
-        record("armadillo", "ours", {"Ours fine": 3e-5}, deltas=[0.3], overrides={"steps": [50, 40, 40]}),
-        record("armadillo", "ours", {"Ours fine": 2e-5}, deltas=[0.2]),
-    ]
-    (table,) = undertrained_tables(records)
-    (row,) = table.rows
-    assert row.values == (0.4, 0.3, 0.2, 4e-5, 3e-5, 2e-5, pytest.approx(2))
-    assert row.published == (6.2e-2, 2e-2, 1.71e-2, 1.11e-5, 1.06e-4, 9.81e-5, pytest.approx(1.11e-5 / 9.81e-5))
-    assert table.notes[0] == "A coarse stage of 25 % costs at most a factor of 2.00 in Chamfer distance."
-    (partial,) = undertrained_tables(records[:2])
-    assert partial.rows[0].values[2] is None
-
-
-def test_deltas() -> None:
-    records = [
-        record("thai", "ours", {"Ours fine": 4e-5}, deltas=[0.02, 0.01]),
-        record("thai", "ours", {"Ours fine": 4e-5}, deltas=[0.04, 0.03], noise=0.01),
-    ]
-    (table,) = delta_tables(records)
-    assert [column.name for column in table.columns] == ["δ₁", "δ₂"]
-    assert [(row.name, row.values, row.published) for row in table.rows] == [
-        ("thai", (0.02, 0.01), (2.71e-2, 1.57e-2)),
-        ("thai + 1 % noise", (0.04, 0.03), (6.9e-2, 5.2e-2)),
-    ]
-    assert table.notes[0] == "The widest band is 4.00 % of the unit sphere's radius."
-
-
-def test_helpers() -> None:
-    assert mean([1.0, None, 3.0]) == 2.0
-    assert mean([None]) is median([]) is None
-    assert median([1.0, None, 9.0, 2.0]) == 2.0
-    assert ratio(1.0, 0.0) is ratio(None, 1.0) is None
-    assert printed_name("xyzrgb_Dragon", BANF) == "dragon"
-    assert printed_name("cow", BANF) is None
-    assert select([record("a", "x", {}), record("b", "x", {})], shape="b", method="x", overrides={})[0]["outputs"] == []
-
-
 TABLE = Table(
     "made-up",
     "A table",
@@ -268,34 +196,6 @@ def test_rows_must_fit() -> None:
         Table("t", "T", "h", (Column("a"), Column("b")), (Row("r", (1,)),))
     with pytest.raises(ValueError, match="3 values for 2 columns"):
         Table("t", "T", "h", (Column("a"), Column("b")), (Row("r", (1, 2), (1, 2, 3)),))
-
-
-def test_page() -> None:
-    section = Section(
-        "made-up",
-        "tab:made-up",
-        "what it shows",
-        (with_missing(TABLE, {"poisson": "needs an extra"}),),
-        (("plots/a.svg", "A plot"), ("plots/b.svg", "Another")),
-        (("sheets/a.png", "A sheet"),),
-        (("ours", "A | B", "nothing"),),
-        ("a, idf: no luck",),
-    )
-    page = as_page(
-        [section, section],
-        title="Made up",
-        command="python -m benchmarks paper x",
-        protocol=["One.", "Two."],
-        machine="a lathe",
-    )
-    assert "    python -m benchmarks paper x\n" in page
-    assert page.count("| ours | A \\| B | nothing |") == 1
-    assert "| poisson: needs an extra | – | – | – |" in page
-    assert page.count("## made-up: what it shows") == 2
-    for part in ("- One.\n- Two.", "a lathe", "`tab:made-up`", "![A plot](plots/a.svg)", "[Another](plots/b.svg)"):
-        assert part in page
-    assert "![A sheet](sheets/a.png)" in page
-    assert "- a, idf: no luck" in page
 
 
 def test_a_plot() -> None:

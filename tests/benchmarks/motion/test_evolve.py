@@ -7,13 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 import trimesh
-from evolutions import QUICK, ball, fails, few_points
+from evolutions import QUICK, ball, few_points
 from mplicits.neural_fields import Field, Jet
 from mplicits.neural_fields.backend.files import write_json
 from mplicits.pipelines.training.settings import FitConfig
 from torch import Tensor
 
-from benchmarks.cli import main
 from benchmarks.harness.report import as_text
 from benchmarks.motion import evolve as bench_evolve
 from benchmarks.motion.evolve import CASES, ExactBench, MorphBench, measure_exact
@@ -107,20 +106,3 @@ def test_a_morph_is_measured_against_meshes(tmp_path: Path) -> None:
     assert f"{row.ends[1] / row.fits[1]:.2f}" in table
     assert [frame.values for frame in curves.rows] == list(zip(row.volumes, row.components, strict=True))
     assert len(list((tmp_path / "out" / "runs").glob("*/run.json"))) == 3
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--meshes a.ply b.ply", "--meshes: the fits need a folder; add -o DIR"),
-        ("--no-exact", "--no-exact: nothing is left to measure"),
-        ("--kind smooth", "--kind: the benchmark says what is trained"),
-        ("--json figures.txt", "unknown extension"),
-        ("--meshes a.ply b.ply --no-exact -o OUT", "a.ply: no such file"),
-        ("--meshes x/a.ply y/a.ply --no-exact -o OUT", "rename one"),
-    ],
-)
-def test_bad_arguments_of_the_benchmark(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: str, message: str
-) -> None:
-    assert message in fails(capsys, f"evolve {arguments.replace('OUT', str(tmp_path / 'out'))}", main)

@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from evolutions import QUICK, fails, few_points
+from evolutions import QUICK, few_points
 from mplicits.neural_fields import TimeSlice
 from mplicits.neural_fields.spacetime.flow import Solver
 from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.pipelines.training.settings import FitConfig
 from torch import Tensor
 
-from benchmarks.cli import main
 from benchmarks.harness.report import as_text
 from benchmarks.motion import motion as bench_motion
 from benchmarks.motion.figures import DeformingField, twisting_bar
@@ -140,21 +139,3 @@ def test_scans_of_the_keys_are_fitted_and_kept(monkeypatch: pytest.MonkeyPatch, 
     assert row.errors[0] < 10
     assert row.volumes[0] == pytest.approx(1, abs=0.5)
     assert "2 key scans with noise of 0.5 %" in as_text(bench.tables([row], sgemm=1e9)[0])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--align pca", "--align: the benchmark says what is trained"),
-        ("--kind morph", "--kind: the benchmark says what is trained"),
-        ("--json figures.txt", "unknown extension"),
-        ("--noise 0", "--noise"),
-        ("--figures bar leg", "no figure is called leg; there are arm, bar, walker"),
-    ],
-)
-def test_bad_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: str, message: str):
-    assert message in fails(capsys, f"motion {arguments} -o {tmp_path / 'out'}", main)
-
-
-def test_fits_of_scans_need_a_folder(capsys: pytest.CaptureFixture[str]):
-    assert "--noise: the fits need a folder; add -o DIR" in fails(capsys, "motion --noise 0.005", main)

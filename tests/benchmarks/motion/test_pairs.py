@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from evolutions import QUICK, fails, few_points
+from evolutions import QUICK, few_points
 from mplicits.neural_fields import Box, Moving, RigidMotion, Similarity, Sphere, extract_mesh
 from mplicits.neural_fields.spacetime.flow import Solver
 from mplicits.neural_fields.spacetime.moving import Keyframes
@@ -16,7 +16,6 @@ from mplicits.pipelines.render.draw import Orbit, orbit_cameras
 from mplicits.pipelines.texture import transport
 from torch import Tensor
 
-from benchmarks.cli import main
 from benchmarks.harness.report import as_text
 from benchmarks.motion import motion, pairs
 from benchmarks.motion.motion import BLEND
@@ -111,22 +110,3 @@ def test_meshes_are_fitted_and_measured(tmp_path: Path, monkeypatch: pytest.Monk
     assert names == {"flat-tall-blend-of-distances.png", "flat-tall-deform.png"}
     # A cell is an eighth: edges of the box are cut off by half of it at most.
     assert rows[0].volumes == pytest.approx([8 * 0.6 * 0.2 * 0.5, 8 * 0.3 * 0.6 * 0.3], rel=0.2)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("a.ply", "1 meshes: expected pairs"),
-        ("a.ply b.ply --noise 0.01", "--noise: is of figures"),
-        ("a.ply b.ply --keys 3", "--keys: is of figures"),
-        ("a.ply b.ply --moments 1", "--moments 1: between two meshes 2 are measured"),
-        ("a.ply b.ply", "a.ply: no such file"),
-        ("--pictures sheets", "--pictures: are of pairs of meshes"),
-    ],
-)
-def test_bad_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: str, message: str):
-    assert message in fails(capsys, f"motion {arguments} -o {tmp_path / 'out'}", main)
-
-
-def test_fits_of_meshes_need_a_folder(capsys: pytest.CaptureFixture[str]):
-    assert "MESH: the fits need a folder; add -o DIR" in fails(capsys, "motion a.ply b.ply", main)

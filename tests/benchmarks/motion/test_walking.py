@@ -1,7 +1,5 @@
 """The walker: both ways agree, derivatives are those of the map, legs are rigid beyond their joints."""
 
-import math
-
 import pytest
 import torch
 from mplicits.neural_fields import TimeSlice, at_time, extract_mesh, flow
@@ -80,9 +78,3 @@ def test_the_field_is_the_body_that_moves():
         slope = (field.value(points + shift) - field.value(points - shift)) / (2 * step)
         # Central differences are off by h² times third derivatives, but where parts meet in between.
         assert ((slope - jet.gradient[:, axis]).abs() < 1e-4).double().mean() > 0.98
-
-
-@pytest.mark.parametrize(("settings", "message"), [({"stride": 1.0}, "stride=1.0"), ({"knee": -math.pi}, "knee=-3.14")])
-def test_bad_arguments(settings: dict[str, float], message: str):
-    with pytest.raises(ValueError, match=message):
-        Walking(**settings)

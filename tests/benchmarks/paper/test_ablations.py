@@ -10,23 +10,16 @@ import pytest
 import torch
 from imageio.v3 import imread
 from mplicits.datasets import read_cloud
-from mplicits.neural_fields import Box, InputError, Mesh, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
+from mplicits.neural_fields import Box, Mesh, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
 from mplicits.pipelines.fit.cloud import CloudDistance
-from mplicits.pipelines.fit.samples import Weights, banded_sources
+from mplicits.pipelines.fit.samples import banded_sources
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.surface.distance import MeshDistance, barycentric_of_nearest
+from mplicits.pipelines.surface.distance import MeshDistance
 
 from benchmarks.harness.cells import make_folder
 from benchmarks.harness.run import run_cell
-from benchmarks.paper.ablations import (
-    DELTA_FACTOR,
-    LOSS_WEIGHTS,
-    delta_factor_tables,
-    error_plots,
-    loss_weight_tables,
-    short,
-)
+from benchmarks.paper.ablations import DELTA_FACTOR, LOSS_WEIGHTS
 from benchmarks.paper.base import (
     Base,
     delta_after,
@@ -38,12 +31,11 @@ from benchmarks.paper.base import (
     up_to,
     without_bands,
 )
-from benchmarks.paper.cells import PaperCell
 from benchmarks.paper.isolation import ISOLATION, IndependentLevels, isolation_tables, residuals_everywhere, steepness
 from benchmarks.paper.judge import fit_config
 from benchmarks.paper.methods import CATALOGUE
 from benchmarks.paper.sheets import write_sheets
-from benchmarks.paper.speed import MARCHING_CUBES, NORMALS, grid_seconds, marching_cubes_tables, normals_tables
+from benchmarks.paper.speed import MARCHING_CUBES, NORMALS, grid_seconds
 from benchmarks.shapes.sampled_error import approximation_error, near_surface
 
 HALF = np.array([0.5, 0.3, 0.4])
@@ -57,65 +49,6 @@ CUBOID = Mesh(
         ]
     ),
 )
-
-
-# Exact distances
-
-
-@pytest.mark.parametrize(
-    ("point", "expected"),
-    [
-        ((0.2, 0.3, 1.0), (0.5, 0.2, 0.3)),  # above the inside
-        ((-1.0, -1.0, 0.5), (1, 0, 0)),
-        ((2.0, -0.5, 0.0), (0, 1, 0)),
-        ((0.5, -1.0, 0.0), (0.5, 0.5, 0)),
-        ((1.0, 1.0, 0.0), (0, 0.5, 0.5)),
-        ((-1.0, 0.25, 0.0), (0.75, 0, 0.25)),
-    ],
-)
-def test_nearest_point_of_a_triangle(point: tuple[float, ...], expected: tuple[float, ...]) -> None:
-    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    weights = barycentric_of_nearest(np.array(point), corners)
-    np.testing.assert_allclose(weights, expected, atol=1e-15)
-    assert [w == 0 for w in weights] == [e == 0 for e in expected]
-
-
-def test_distances_to_a_box_are_exact_inside_outside_and_over_its_edges() -> None:
-    points = np.random.default_rng(0).uniform(-1, 1, (3000, 3))
-    q = np.abs(points) - HALF
-    exact = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
-    np.testing.assert_allclose(MeshDistance(CUBOID).signed(points), exact, atol=1e-14)
-
-
-@pytest.mark.slow
-def test_long_faces_beside_many_small_ones_hide_nobody() -> None:
-    # A large triangle far below a finely triangulated patch: its centre is much further away than it is.
-    grid = np.linspace(-0.05, 0.05, 30)
-    x, y = np.meshgrid(grid, grid, indexing="ij")
-    patch = np.stack((x, y, np.full_like(x, 0.2)), axis=-1).reshape(-1, 3)
-    corner = np.arange(30 * 30).reshape(30, 30)[:-1, :-1].reshape(-1)
-    faces = np.concatenate((corner[:, None] + [0, 30, 1], corner[:, None] + [1, 30, 31]))
-    vertices = np.concatenate((patch, [[-1, -1, 0], [1, -1, 0], [0, 2, 0]]))
-    both = Mesh(vertices, np.concatenate((faces, len(patch) + np.array([[0, 1, 2]]))))
-    points = np.array([[0.0, -0.9, 0.03], [0.03, 0.02, 0.06], [0.03, 0.02, 0.14], [0.0, 0.0, 0.25]])
-    np.testing.assert_allclose(MeshDistance(both).signed(points), [0.03, 0.06, -0.06, 0.05], atol=1e-14)
-
-
-def test_sign_at_a_sharp_tip_is_that_of_all_faces_around_it() -> None:
-    # Past the tip of a flat needle two of its faces, taken alone, would say inside.
-    tip = Mesh(
-        np.array([[1.0, 0, 0], [0, 0.2, 0], [0, -0.1, 0.17], [0, -0.1, -0.17]]),
-        np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]),
-    )
-    directions = np.random.default_rng(1).normal(size=(500, 3)) * 0.1
-    directions[:, 0] = np.abs(directions[:, 0]) + 0.3
-    assert (MeshDistance(tip).signed(np.add([1, 0, 0], directions)) > 0).all()
-    assert MeshDistance(tip).signed(np.array([[0.5, 0.0, 0.0]]))[0] < 0
-
-
-def test_a_surface_without_faces_has_no_distances() -> None:
-    with pytest.raises(ValueError, match="no faces"):
-        MeshDistance(Mesh(np.eye(3), np.array([[0, 0, 1]])))
 
 
 def test_approximation_error_of_an_exact_and_of_a_shifted_field() -> None:
@@ -240,14 +173,6 @@ def test_residual_levels_see_the_cloud_that_level_0_has_judged(base: Base) -> No
     np.testing.assert_array_equal(reviewed(flipped, up_to(base.field, 0), trusting).normals, normals)
 
 
-def test_weights_stand_where_they_are_given(base: Base) -> None:
-    errors, cloud = torch.full((4,), 0.01), base.index()
-    assert cloud.noise == 0
-    usual = Weights().resolved(base.config, errors, cloud)
-    assert usual == pytest.approx((1e4, base.config.normal_weight, base.config.eikonal_weight))
-    assert Weights(data=0.0, eikonal=7.0).resolved(base.config, errors, cloud) == (0.0, base.config.normal_weight, 7.0)
-
-
 def test_sources_of_the_variants(base: Base) -> None:
     index, previous = base.index(), up_to(base.field, 0)
     delta = delta_after(index, previous, base.config)
@@ -276,13 +201,6 @@ def test_a_residual_without_bands_learns_the_whole_domain(base: Base) -> None:
     assert float((field.value(x) - exact).abs().mean()) < float((base.field.base.value(x) - exact).abs().mean())  # type: ignore[operator]
 
 
-def test_short_schedules_are_for_cpus_only() -> None:
-    config = fit_config("smoke")
-    assert short(config, "smoke") is config
-    assert short(config, "paper") is config
-    assert max(short(fit_config("cpu"), "cpu").steps) == 120
-
-
 def test_grid_seconds_count_what_was_left_out() -> None:
     rows = []
 
@@ -309,53 +227,6 @@ def record(method: str, outputs: list[dict[str, Any]], *, shape: str = "ball", *
     return {"cell": cell, "outputs": outputs, "deltas": [], "details": {}, "environment": {"device": "cpu"}} | more
 
 
-def test_loss_weight_rows() -> None:
-    def at(shape: str, level: int, errors: dict[float, float]) -> dict[str, Any]:
-        outputs = [{"name": f"{w:g}", "weight": w, "error": e} for w, e in errors.items()]
-        cell = {"overrides": {"constraint": "normal", "level": level}}
-        return record(
-            "loss-weights", outputs, shape=shape, cell=cell, details={"without": 0.5 * level, "fit": 0.1 * level}
-        )
-
-    records = [
-        record("ours", [{"name": "Ours fine", "chamfer": 1.0}]),
-        at("ball", 1, {0: 0.1, 100: 0.2}),
-        at("ball", 2, {0: 0.01, 100: 0.02}),
-        at("cube", 1, {0: 0.3, 100: 0.4}),
-    ]
-    (table,) = loss_weight_tables(records)
-    assert table.name == "loss-weights-normal"
-    names = ["0", "100", "level not trained at all", "the finished fit, its own weights"]
-    assert [row.name for row in table.rows] == names
-    assert table.rows[0].values == pytest.approx((0.2, 0.01))
-    assert table.rows[1].values == pytest.approx((0.3, 0.02))
-    assert table.rows[2].values == pytest.approx((0.5, 1.0))
-    assert table.rows[3].values == pytest.approx((0.1, 0.2))
-    assert table.rows[0].published == (0.0073, 0.0017)
-    assert table.rows[1].published == (0.0081, 0.0013)
-    assert "ball, cube" in table.notes[0]
-    (plot,) = LOSS_WEIGHTS.plots(records)
-    assert plot.places == ("0", "100")
-    assert [series.name for series in plot.series] == [
-        f"{level} level{whose}" for level in ("medium", "fine") for whose in ("", ", paper")
-    ]
-    assert plot.series[0].values == pytest.approx((0.2, 0.3))
-    assert plot.series[1].values == (0.0073, 0.0081)
-
-
-def test_delta_factor_rows() -> None:
-    def at(epsilon: float, medium: float, fine: float) -> dict[str, Any]:
-        outputs = [{"name": "medium", "error": medium}, {"name": "fine", "error": fine}]
-        return record("delta-factor", outputs, cell={"overrides": {"epsilon": epsilon}}, deltas=[0.02, 0.01])
-
-    (table,) = delta_factor_tables([at(4.0, 0.3, 0.2), at(0.01, 0.03, 0.02), at(0.3, 0.05, 0.04)])
-    assert [row.name for row in table.rows] == ["1.01", "1.3", "5"]
-    assert table.rows[1].values == pytest.approx((0.02, 0.01, 0.05, 0.04))
-    assert table.rows[1].published == (None, None, 0.0103, 0.0050)
-    (plot,) = error_plots([table])
-    assert [series.values for series in plot.series[:2]] == [(0.03, 0.05, 0.3), (0.0098, 0.0103, 0.0139)]
-
-
 def test_isolation_rows() -> None:
     def figures(name: str, chamfer: float | None, components: int) -> dict[str, Any]:
         found = {"hausdorff": 2 * (chamfer or 0), "shell_iou": 0.5, "iou": 0.9, "components": components}
@@ -380,35 +251,8 @@ def test_isolation_rows() -> None:
     assert a.published is not None
     assert a.published[:4] == (6.39e-5, 1.49e-5, 1.45e-3, 0.687)
     assert a.published[6:10] == (3.87e-5, 1.38e-5, 5.86e-3, 0.653)
-    assert [row.values for row in culling.rows] == [
-        (2.0, "1 to 3"),
-        (1.5, "1"),
-        (5.0, "2"),
-        (50.0, "1,234"),
-    ]
+    assert [row.values for row in culling.rows] == [(2.0, "1 to 3"), (1.5, "1"), (5.0, "2"), (50.0, "1,234")]
     assert culling.rows[3].published == (2.8e-1, "365 to 4,109")
-
-
-def test_marching_cubes_rows() -> None:
-    seconds = {"baseline": 8.0, "without culling": 6.0, "with culling": 2.0, "ours": 0.5}
-    outputs = [{"name": name, "seconds": spent} for name, spent in seconds.items()]
-    (table,) = marching_cubes_tables([record("ours", []), record("marching-cubes", outputs, shape="armadillo")])
-    assert table.rows[0].values == (8.0, 6.0, 2.0, 4.0, 0.5, 16.0)
-    assert table.rows[0].published == pytest.approx((4.87, 4.10, 0.99, 4.87 / 0.99, None, None))
-    assert [row.name for row in table.rows[1:]] == [f"{name} (paper only)" for name in ("Lucy", "Dragon", "Thai")]
-
-
-def test_normals_rows() -> None:
-    seconds = {"autograd": 4.0, "algorithm 1": 2.0, "ours": 1.0}
-    outputs = [{"name": name, "seconds": spent} for name, spent in seconds.items()]
-    cell = {"overrides": {"depth": 2, "side": 512}}
-    (table,) = normals_tables([record("normals", outputs, cell=cell, details={"largest_difference": 3e-6})])
-    assert table.rows[0].name == "256x2, 512x512"
-    assert table.rows[0].values == (4.0, 2.0, 1.0, 2.0, 4.0)
-    published = table.rows[0].published
-    assert published is not None
-    assert published[:2] == pytest.approx((0.022 / 3, 0.004))
-    assert "3.0e-06" in table.notes[1]
 
 
 def test_tables_of_nothing() -> None:
@@ -451,13 +295,3 @@ def test_smoke(spec: Any, ball: Path, out: Path) -> None:
         assert noisy[0] > clean[0]  # a row more: what culling hides
     again = [run_cell(cell, out, CATALOGUE) for cell in cells]
     assert again == records
-
-
-def test_a_cloud_without_faces_has_no_exact_distances(tmp_path: Path, out: Path) -> None:
-    rng = np.random.default_rng(0)
-    normals = rng.normal(size=(400, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    np.savetxt(tmp_path / "cloud.xyz", np.concatenate((normals, normals), axis=1))
-    cell = PaperCell(tmp_path / "cloud.xyz", "delta-factor", "smoke", overrides=(("epsilon", 0.3),))
-    with pytest.raises(InputError, match="has no faces"):
-        run_cell(cell, out, CATALOGUE)

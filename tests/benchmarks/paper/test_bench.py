@@ -11,13 +11,10 @@ from mplicits.neural_fields import Similarity, Sphere, extract_mesh
 from mplicits.pipelines.mesh.files import write_mesh
 
 from benchmarks.cli import main
-from benchmarks.harness import plots
 from benchmarks.harness.cells import Catalogue, Findings, Method
 from benchmarks.paper import bench, names
-from benchmarks.paper.bench import SPECS
 from benchmarks.paper.cells import PaperCell
 from benchmarks.paper.judge import Judge
-from benchmarks.paper.methods import CATALOGUE, METHODS
 
 PLACE = Similarity((0.0, 0.0, 0.0), 2.0)
 
@@ -51,19 +48,6 @@ def exact(monkeypatch: pytest.MonkeyPatch) -> type[Exact]:
     monkeypatch.setattr(bench, "sgemm_rate", lambda *_, **__: 1e9)
     Exact.runs = 0
     return Exact
-
-
-def test_names_are_those_that_exist() -> None:
-    assert tuple(spec.name for spec in SPECS) == names.TABLES
-    assert tuple(method.name for method in METHODS[: len(names.METHODS)]) == names.METHODS
-    assert len({method.name for method in METHODS}) == len(METHODS)
-    for spec in SPECS:
-        for cell in spec.cells([Path("a.ply"), Path("b.ply")], "smoke"):
-            assert CATALOGUE.named(cell.method).source
-        assert isinstance(spec.tables([]), tuple)
-        assert spec.plots([]) == ()
-    with pytest.raises(ValueError, match="did you mean 'banf'"):
-        CATALOGUE.named("banff")
 
 
 def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixture[str]) -> None:
@@ -142,13 +126,8 @@ def test_ctrl_c(ball: Path, tmp_path: Path, exact, monkeypatch, capsys: pytest.C
     [
         (["--table", "nosie"], "--table: there is no 'nosie'; did you mean 'noise'?"),
         (["--table", "comparison,bamf"], "--table: there is no 'bamf'; did you mean 'banf'?"),
-        (["--table", ","], "--table: expected some of"),
         (["--methods", "igp-fine"], "--methods: there is no 'igp-fine'; did you mean 'ingp-fine'?"),
-        (["--preset", "gpu"], "--preset: there is no 'gpu'"),
-        (["--jobs", "0"], "expected a whole number from 1"),
-        (["--json", "a.txt"], "unknown extension"),
         (["--reference", "BALL"], "every shape is a mesh"),
-        (["--tabel", "noise"], "unknown flag --tabel; did you mean '--table'?"),
     ],
 )
 def test_mistakes(
@@ -161,20 +140,3 @@ def test_mistakes(
     assert message in error
     assert error.count("\n") == 1
     assert not (out / "results.md").exists()
-
-
-def test_mistakes_in_places(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for place, message in ((ball, "is a file; name a folder"), (ball / "bench", "cannot be written")):
-        assert main(["paper", str(ball), "-o", str(place)]) == 2
-        assert message in capsys.readouterr().err
-    assert main(["paper", str(tmp_path / "gone.ply"), "-o", str(tmp_path / "bench")]) == 2
-    assert "no such file" in capsys.readouterr().err
-
-
-def test_without_matplotlib_nothing_is_begun(
-    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(plots, "find_spec", lambda name: None)
-    assert main(["paper", str(ball), "-o", str(tmp_path / "bench")]) == 2
-    assert "pip install 'mplicits[bench]'" in capsys.readouterr().err
-    assert not (tmp_path / "bench").exists()

@@ -16,9 +16,9 @@ from benchmarks.harness.cells import Catalogue, Findings, Method, key_of, make_f
 from benchmarks.harness.run import run_cell, run_cells
 from benchmarks.paper.bench import find_shapes
 from benchmarks.paper.cells import Input, PaperCell, TableSpec, cells_of
-from benchmarks.paper.judge import Judge, damaged_cloud, fit_config, flip_normals, oriented_cloud, protocol_of
+from benchmarks.paper.judge import Judge, damaged_cloud, fit_config, flip_normals, oriented_cloud
 from benchmarks.paper.methods import CATALOGUE
-from benchmarks.paper.ours import FromRecipe, Ours, level_names
+from benchmarks.paper.ours import FromRecipe, Ours
 from benchmarks.paper.recipe import Output, Recipe
 
 PLACE = Similarity((5.0, 0.0, -1.0), 20.0)
@@ -90,14 +90,6 @@ def test_settings_of_ours_are_in_the_key_but_not_the_device(ball: Path) -> None:
     assert CATALOGUE.key(plain) != CATALOGUE.key(dataclasses.replace(plain, preset="cpu"))
 
 
-def test_names() -> None:
-    assert PaperCell(Path("a/b.ply"), "idf", "cpu").name == "b, idf"
-    cell = PaperCell(Path("b.ply"), "ours", "cpu", noise=0.01, outliers=0.05, overrides=(("steps", (1, 2)),))
-    assert cell.name == "b + noise 0.01 + outliers 0.05, ours, steps=1 2"
-    assert level_names(2) == ["Ours coarse", "Ours fine"]
-    assert level_names(4) == ["Ours coarse", "Ours medium 1", "Ours medium 2", "Ours fine"]
-
-
 def test_flipped_normals_are_as_many_as_asked_for() -> None:
     normals = np.tile(np.float32([0, 0, 1]), (200, 1))
     cloud = PointCloud(np.random.default_rng(0).random((200, 3)), normals)
@@ -163,12 +155,7 @@ def test_no_surface_is_a_result(ball: Path, out: Path) -> None:
 
 def test_a_failure_stops_nothing_and_is_tried_again(ball: Path, out: Path) -> None:
     good, bad = Exact("good"), Exact("bad", radius=None)
-    methods = Catalogue(
-        (
-            good,
-            bad,
-        )
-    )
+    methods = Catalogue((good, bad))
     cells = [PaperCell(ball, "bad", "smoke"), PaperCell(ball, "good", "smoke")]
     lines: list[str] = []
     ran = run_cells(cells, out, methods, say=lines.append)
@@ -221,12 +208,7 @@ def test_ctrl_c_keeps_what_is_finished(ball: Path, out: Path, reason: BaseExcept
             raise reason
 
     good, stopped = Exact("good"), Stopped("stopped")
-    methods = Catalogue(
-        (
-            good,
-            stopped,
-        )
-    )
+    methods = Catalogue((good, stopped))
     cells = [PaperCell(ball, "good", "smoke"), PaperCell(ball, "stopped", "smoke")]
     with pytest.raises(type(reason)):
         run_cells(cells, out, methods, say=lambda _: None)
@@ -332,16 +314,6 @@ def test_shapes(ball: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="leave it out"):
         find_shapes([ball], reference=ball)
     assert find_shapes([ball, scan], reference=ball) == [Input(ball), Input(scan, ball)]
-
-
-def test_presets_grow() -> None:
-    sizes = [protocol_of(preset) for preset in ("smoke", "cpu", "paper")]
-    for name in ("resolution", "samples"):
-        numbers = [getattr(size, name) for size in sizes]
-        assert numbers == sorted(numbers)
-        assert numbers[0] < numbers[1]
-    assert (sizes[2].resolution, sizes[2].samples, sizes[2].poisson_depth) == (512, 500_000, 10)
-    assert fit_config("paper").widths == (128, 256, 400)
 
 
 def test_keys_are_those_of_folders_written_before(tmp_path: Path) -> None:

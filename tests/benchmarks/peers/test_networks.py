@@ -29,10 +29,8 @@ from benchmarks.paper.networks import (
     IdfRecipe,
     SirenRecipe,
     SirenWeights,
-    _CloudBatches,
     begin_as_sphere,
     displaced,
-    hand_over,
     laplacian_samples,
     siren_loss,
 )
@@ -128,32 +126,6 @@ def test_bacon_is_a_sum_of_the_sines_that_its_bound_allows() -> None:
     torch.testing.assert_close(field.value(x), expected * head.weight[0, 0] + head.bias[0])
 
 
-def test_bacon_has_the_published_size_but_for_what_is_never_used() -> None:
-    field = BaconSDF()
-    assert field.harmonics(level=-1) == 192
-    # 530,953 with five filters and five outputs that take no part.
-    assert sum(p.numel() for p in field.parameters()) == 530_953 - 5 * 256 - 5 * 257
-    assert field.parameters_to(-1) == sum(p.numel() for p in field.parameters()) - 3 * 257
-    assert field.parameters_to(0) == 256 + 2 * 257 * 256 + 257
-
-
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
-        ({"width": 0}, "width"),
-        ({"bands": (3,)}, "bands"),
-        ({"bands": (1, 0)}, "bands"),
-        ({"outputs": ()}, "outputs"),
-        ({"outputs": (2, 2)}, "outputs"),
-        ({"outputs": (9,)}, "outputs"),
-        ({"period": 0.0}, "period"),
-    ],
-)
-def test_bacon_says_what_is_wrong(options: dict[str, object], word: str) -> None:
-    with pytest.raises(ValueError, match=f"{word}="):
-        BaconSDF(**options)  # pyright: ignore[reportArgumentType]
-
-
 def test_idf_without_displacement_is_its_base() -> None:
     field = small_idf().double()
     x = 2 * torch.rand(200, 3, dtype=torch.float64) - 1
@@ -191,12 +163,6 @@ def test_attenuation_is_a_half_at_its_reach_and_has_its_derivative() -> None:
     torch.testing.assert_close(torch.autograd.grad(chi.sum(), value)[0], slope)
     assert float(attenuation(torch.tensor(0.05), 0.05)[0]) == pytest.approx(0.5)
     assert all(a > b for a, b in itertools.pairwise(chi[50:].detach().tolist()))
-
-
-@pytest.mark.parametrize("name", ["limit", "reach"])
-def test_idf_says_what_is_wrong(name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name}=0"):
-        IdfSDF(8, 2, **{name: 0.0})  # pyright: ignore[reportArgumentType]
 
 
 def test_both_train_through_their_gradients() -> None:
@@ -261,14 +227,6 @@ def test_recipe_reports_repeats_itself_and_leaves_no_trace(recipe: Recipe, spher
     assert recipe.differs
 
 
-def test_published_sizes_are_those_of_the_paper_preset() -> None:
-    siren, bacon, idf = SIREN_PRESETS["paper"], BACON_PRESETS["paper"], IDF_PRESETS["paper"]
-    assert (siren.width, siren.depth, siren.omega) == (256, 4, 30.0)
-    assert BaconSDF(bacon.width, bands=bacon.bands, outputs=bacon.outputs).harmonics() == 192
-    field = IdfSDF(idf.width, idf.depth, omegas=idf.omegas)
-    assert sum(p.numel() for p in field.parameters()) == (1_191_943 - 1) // 3
-
-
 def test_siren_loss_by_hand() -> None:
     """Two points on the surface, one off it; a gradient at 60 degrees to the normal has a cosine of a half."""
     value = torch.tensor([0.1, -0.3, 0.02])
@@ -297,21 +255,6 @@ def test_sphere_start_reaches_into_the_corners_of_the_cube(omega: float) -> None
     assert bool((value[distance > 1] > 0.2).all())
 
 
-def test_no_step_towards_a_sphere_changes_nothing() -> None:
-    network = Siren(8, 1)
-    before = [parameter.clone() for parameter in network.parameters()]
-    begin_as_sphere(network, 0)
-    assert all(torch.equal(a, b) for a, b in zip(before, network.parameters(), strict=True))
-
-
-def test_batches_hold_the_share_of_points_off_the_surface(sphere: OrientedCloud) -> None:
-    points, normals = _CloudBatches(sphere, 200, 0.6, seed=0, device="cpu").draw()
-    assert (len(points), len(normals)) == (200, 80)
-    torch.testing.assert_close(points[:80].norm(dim=1), torch.ones(80), atol=2e-3, rtol=0)
-    torch.testing.assert_close(points[:80], normals, atol=0.05, rtol=0)
-    assert float(points[80:].norm(dim=1).std()) > 0.1
-
-
 def test_laplacian_samples_have_their_spread_and_stay_in_the_period(sphere: OrientedCloud) -> None:
     distances = CloudDistance(torch.from_numpy(sphere.points), torch.from_numpy(sphere.normals))
     generator = torch.Generator().manual_seed(0)
@@ -321,10 +264,6 @@ def test_laplacian_samples_have_their_spread_and_stay_in_the_period(sphere: Orie
     assert float(distance.abs().mean()) == pytest.approx(0.02, rel=0.1)
     # The discs of 2,000 points lie 0.001 within the sphere.
     assert float((distance - (points.norm(dim=1) - 1)).abs().median()) < 2e-3
-
-
-def test_schedule_of_idf_hands_over_from_base_to_displacement() -> None:
-    assert [hand_over(done) for done in (0.0, 0.2, 0.35, 0.5, 1.0)] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0])
 
 
 def test_idf_trains_on_its_own_gradient_where_the_base_is_flat() -> None:

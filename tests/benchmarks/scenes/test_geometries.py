@@ -1,7 +1,6 @@
 """Geometries with the same colour network: what is equal, whose rate counts, and the intervals."""
 
 import dataclasses
-import statistics
 from pathlib import Path
 
 import pytest
@@ -23,7 +22,6 @@ from benchmarks.scenes.geometries import (
     GeometryRow,
     _Training,
     best_trainings,
-    interval,
     single_siren,
 )
 from benchmarks.scenes.reconstruct import read_scene
@@ -92,14 +90,6 @@ def test_only_those_that_are_asked_for_are_trained(bench, capsys):
     assert "--geometries: without --geometry-only all rows are trained; add it" in capsys.readouterr().err
 
 
-def test_the_interval_is_students():
-    # t of 95 % and two degrees of freedom is 4.30265; the spread of 1, 2, 3 is 1.
-    assert interval([1.0, 2.0, 3.0]).mean == 2
-    assert interval([1.0, 2.0, 3.0]).half == pytest.approx(4.30265 / 3**0.5, rel=1e-5)
-    with pytest.raises(statistics.StatisticsError):
-        interval([1.0])
-
-
 def test_the_best_rate_of_each_counts_and_gains_are_paired(bench, tmp_path, monkeypatch):
     first = bench.run(bench.cells()[0], Workplace(tmp_path, "one"))
     row = bench.read([{"outputs": list(first.outputs)}])[0]
@@ -120,13 +110,6 @@ def test_the_best_rate_of_each_counts_and_gains_are_paired(bench, tmp_path, monk
     assert table.rows[0].values[4] == "20.50 ± 6.35"  # t is 12.7062 with one degree of freedom
     assert table.rows[0].values[6:8] == ("2.00 ± 0.00", "60.00 ± 0.00")  # thousandths, and arccos 0.5
     assert [line.values for line in gains.rows] == [(2, "+2.00 ± 0.00", "2 better"), (2, "+0.00 ± 12.71", "1 better")]
-
-
-def test_cells_are_whole_seeds_first(bench):
-    cells = [cell.parameters for cell in bench.cells()]
-    assert len(cells) == 2 * 3 + 3
-    assert [one["seed"] for one in cells] == 6 * [0] + 3 * [1]
-    assert {one["geometry"] for one in cells[:3]} == {one["geometry"] for one in cells[6:]} == set(GEOMETRIES)
 
 
 def test_other_seeds_have_the_rate_of_the_first(bench, tmp_path, monkeypatch):
@@ -163,13 +146,3 @@ def test_several_trainings_at_a_time_find_what_one_after_the_other_does(bench, t
     assert tables[0] == tables[1]
     # A cell for each rate, the second seed's, and that under its own rate, each done once.
     assert len(list((tmp_path / "2" / "cells").iterdir())) == 2 + 1 + 1
-
-
-def test_streams_are_for_the_geometry_alone(capsys):
-    assert main(["reconstruct", "figure", "--streams", "2"]) == 2
-    assert "--streams: rows are compared by their time, one by one" in capsys.readouterr().err
-
-
-def test_rates_without_the_geometry_alone_are_refused(capsys):
-    assert main(["reconstruct", "figure", "--rates", "1e-3"]) == 2
-    assert "--rates: only --geometry-only tries several" in capsys.readouterr().err

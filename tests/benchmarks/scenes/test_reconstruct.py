@@ -4,7 +4,6 @@ import dataclasses
 import json
 from pathlib import Path
 
-import imageio.v3 as iio
 import pytest
 import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
@@ -13,7 +12,6 @@ from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.neural_fields.networks.radiance import Outside, ViewColor
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective, scene_trainer
-from mplicits.pipelines.surface.surface import in_region
 from mplicits.pipelines.training.replay import Again
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import StopFlag
@@ -236,39 +234,11 @@ def test_surfaces_are_held_against_the_exact_one(bench):
         assert least < row.surface.chamfer < 1.5 * ball.chamfer
 
 
-def test_what_lies_outside_the_region_of_interest_is_left_out():
-    ball = extract_mesh(Sphere(radius=0.5), resolution=32)
-    whole = in_region(ball)
-    assert whole is not None
-    assert len(whole.faces) == len(ball.faces)
-    corner = Sphere(radius=0.1, center=(0.8, 0.8, 0.8))
-    both = in_region(extract_mesh(Union(Sphere(radius=0.5), corner), resolution=32))
-    assert len(both.faces) == len(ball.faces)
-    assert in_region(extract_mesh(corner, resolution=32)) is None
-
-
 def files_of(bench, folder: str, suffix: str) -> dict[str, Path]:
     """What is kept of each row."""
     out, ours, *_ = bench
     key = Catalogue([ours]).key
     return {part.parameters["kind"]: out / folder / f"{key(part)}{suffix}" for part in ours.cells()}
-
-
-def test_pictures_and_meshes(bench):
-    out = bench[0]
-    for folder, suffix in (("cells", ".json"), ("pictures", "-views.png"), ("meshes", "-surface.ply")):
-        assert {*(out / folder).iterdir()} == {*files_of(bench, folder, suffix).values()}
-    factor = 600 // 24
-    sheet = iio.imread(files_of(bench, "pictures", "-views.png")[NEUS])
-    assert sheet.shape == (12 * factor, 24 * factor, 3)
-    common = iio.imread(out / "painted-sphere.png")
-    assert common.shape == (2 * (8 * factor + 40), 4 * (8 * factor + 12), 3)
-    # The photograph, then what NeuS renders, as they are on its own sheet.
-    side = 8 * factor
-    for column in range(2):
-        left = 6 + column * (side + 12)
-        assert (common[40 : 40 + side, left : left + side] == sheet[:side, column * side : (column + 1) * side]).all()
-    assert (common[80 + side :, side + 18 : 2 * side + 18] == sheet[:side, 2 * side :]).all()
 
 
 def test_finished_rows_are_used_again(bench):
@@ -387,16 +357,11 @@ def test_the_command_goes_on_after_an_interruption(tmp_path, capsys, monkeypatch
         (["painted-shpere"], "painted-shpere: no such data set, and no scene of that name; did you mean"),
         (["figure", "--geometry", "neus"], "--geometry: the benchmark trains both; leave it out"),
         (["figure", "--jets", "9"], "--jets: rows see the same rays, as many in every step; leave it out"),
-        (["figure", "--focus", "1"], "--focus: rows see the same rays"),
         (
             ["figure", "--geometry-only", "--neus-learning-rate", "1e-3"],
             "--neus-learning-rate: --geometry-only tries the same rates for all; give --rates",
         ),
-        (["figure", "--time-budget", "9"], "--time-budget: rows are compared after as many steps"),
         (["figure", "--views", "2", "--size", "8", "--test-every", "0"], "figure: no picture is held out"),
-        (["figure", "--json", "rows.txt"], "rows.txt: unknown extension '.txt'"),
-        (["figure", "--equaltime"], "unknown flag --equaltime; did you mean '--equal-time'?"),
-        (["figure", "--steps", "0"], "steps: 0; expected a whole number > 0"),
     ],
 )
 def test_mistakes_are_one_line(arguments, message, capsys, tmp_path, monkeypatch):

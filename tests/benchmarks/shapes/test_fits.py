@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import add_isotropic_noise, read_cloud
+from mplicits.datasets import read_cloud
 from mplicits.datasets.synthetic.prisms import PRISMS
-from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Similarity, Sphere, Union, extract_mesh
+from mplicits.neural_fields import Mesh, MultiscaleSDF, Similarity, Sphere, Union, extract_mesh
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.surface.surface import components, face_normals
 from mplicits.pipelines.training.settings import FitConfig
@@ -89,17 +89,6 @@ def test_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.M
     assert 0.9 * 0.01 * diagonal < seen[1] < 1.01 * 0.01 * diagonal + 0.02
 
 
-def test_isotropic_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-    monkeypatch.setattr(
-        FitBench, "reconstructions", lambda _, cloud, *__: seen.append(cloud) or [("level 0", 1, 1, None)]
-    )
-    bench = FitBench(shapes=[ball], config=SMALL, noise=0.01, isotropic=True)
-    rows = bench.rows(tmp_path)
-    assert np.array_equal(seen[0].points, add_isotropic_noise(read_cloud(ball), 0.01).points)
-    assert "ball + isotropic noise 0.01" in as_text(*bench.tables(rows, sgemm=1e9))
-
-
 def test_poisson_has_normals_of_its_own_where_ours_are_estimated(ball: Path, tmp_path: Path) -> None:
     pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
     config = replace(SMALL, normals="estimate")
@@ -117,29 +106,6 @@ def test_screened_poisson_when_installed(ball: Path, tmp_path: Path) -> None:
     assert rows[-1].metrics is not None
     assert rows[-1].metrics.iou is not None
     assert rows[-1].metrics.iou > 0.95
-
-
-def test_screened_poisson_on_what_ours_has_smoothed(ball: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
-    bench = FitBench(shapes=[ball], config=SMALL, noise=0.02, resolution=32, samples=5000, poisson_depth=6)
-    rows = bench.rows(tmp_path)
-    assert [row.method for row in rows[-2:]] == ["screened Poisson", "screened Poisson, smoothed"]
-    noisy, smoothed = (row.metrics for row in rows[-2:])
-    assert noisy is not None
-    assert smoothed is not None
-    assert smoothed.chamfer - smoothed.chamfer_floor < (noisy.chamfer - noisy.chamfer_floor) / 3
-
-
-def test_a_level_without_a_surface_is_a_row(monkeypatch: pytest.MonkeyPatch, ball: Path, tmp_path: Path) -> None:
-    monkeypatch.setattr(FitBench, "reconstructions", lambda *_: [("level 0", 1.0, 0.1, None)])
-    bench = FitBench(shapes=[ball], config=SMALL)
-    assert "no surface" in as_text(*bench.tables(bench.rows(tmp_path), sgemm=1e9))
-
-
-def test_a_cloud_is_no_reference(tmp_path: Path) -> None:
-    np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((50, 3)))
-    with pytest.raises(InputError, match="has no faces"):
-        FitBench(shapes=[tmp_path / "cloud.xyz"], config=SMALL).cells()
 
 
 def test_the_camera_faces_the_widest_side() -> None:

@@ -10,22 +10,11 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import turntable
-from mplicits.neural_fields import (
-    Field,
-    InputError,
-    MultiscaleSDF,
-    Similarity,
-    Siren,
-    Sphere,
-    extract_mesh,
-    save_field,
-)
+from mplicits.neural_fields import Field, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh, save_field
 from mplicits.neural_fields.checkpoint import SavedField
 from mplicits.pipelines.mesh.files import write_mesh
 
 from benchmarks.cli import main
-from benchmarks.harness.cells import Workplace
-from benchmarks.harness.report import as_text
 from benchmarks.shapes import normal_map as module
 from benchmarks.shapes.normal_map import NormalMapBench
 
@@ -128,42 +117,6 @@ def test_the_angle_between_normals_in_closed_form(opened, tmp_path):
         cosine = (hit * other).sum(axis=1) / np.linalg.norm(hit, axis=1) / np.linalg.norm(other, axis=1)
         angles.append(np.degrees(np.arccos(cosine.clip(-1, 1))))
     assert rows[1].degrees == pytest.approx(np.concatenate(angles).mean(), rel=5e-3)
-
-
-@pytest.mark.slow
-def test_lambert_and_normals_are_compared_too(opened, tmp_path):
-    bench = opened(bumpy_ball(), 1)
-    for shading in ("lambert", "normals"):
-        rows = dataclasses.replace(bench, shading=shading).rows(tmp_path / "out")
-        assert rows[4].error.both < rows[1].error.both < rows[0].error.both
-
-
-def test_the_table(opened, tmp_path):
-    bench = opened(bumpy_ball(), 1)
-    rows = bench.rows(tmp_path / "out")
-    text = as_text(*bench.tables(rows, sgemm=1e9))
-    assert len(text.splitlines()) == 3 + len(rows)
-    line = next(line for line in text.splitlines() if line.startswith("level 0 + normals of level 1"))
-    assert f"{math.sqrt(rows[1].error.either):.4f}" in line
-    assert f"{rows[1].degrees:.1f}°" in line
-    assert bench.run(bench.cells()[0], Workplace(tmp_path, "")).outputs[1]["rmse_both"] == rows[1].rmse_both
-    assert rows[4].parameters - rows[0].parameters == 16 * 3 + 16 + 17
-    assert rows[3].prepare_seconds > rows[2].prepare_seconds > 0 == rows[0].prepare_seconds
-
-
-def test_another_shape_or_place_is_refused(opened, tmp_path):
-    bench = opened(bumpy_ball(), 0)
-    for name, similarity in (("unit.ply", Similarity.identity()), ("large.ply", Similarity(PLACE.center, 40.0))):
-        write_mesh(tmp_path / name, extract_mesh(Sphere(radius=RADIUS), resolution=32), similarity)
-        with pytest.raises(InputError, match=f"{name}: half of its vertices are further than 0.1"):
-            dataclasses.replace(bench, reference=tmp_path / name).rows(tmp_path / "out")
-    np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((50, 3)))
-    with pytest.raises(InputError, match=r"cloud.xyz: has no faces"):
-        dataclasses.replace(bench, reference=tmp_path / "cloud.xyz").cells()
-    with pytest.raises(InputError, match="level 0 has no surface"):
-        module._methods(Sphere(radius=0.5, center=(9.0, 0.0, 0.0)), "run", 32, torch.device("cpu"), lambda _: None)
-    with pytest.raises(InputError, match="has one level"):
-        opened(Sphere(radius=RADIUS), 0).rows(tmp_path / "out")
 
 
 def test_the_command(tmp_path, capsys):

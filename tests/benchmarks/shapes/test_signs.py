@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mplicits.datasets import OrientedCloud, PointCloud
-from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
+from mplicits.neural_fields import Similarity, Sphere, extract_mesh
 from mplicits.pipelines.fit.train import prepare
 from mplicits.pipelines.fit.unoriented import SIGNING
 from mplicits.pipelines.mesh.files import write_mesh
@@ -65,9 +65,3 @@ def test_points_that_smoothing_drops_do_not_mix_up_the_others(ball: Path, monkey
     monkeypatch.setattr(module, "prepare", lambda *_: still)
     exact = module._exact_normals(clean, clean, smoothed, CONFIG)
     assert (exact == clean.normals[left]).mean() > 0.99  # but for two that lie closer together than they were moved
-
-
-def test_a_cloud_is_no_shape(ball: Path, tmp_path: Path) -> None:
-    (tmp_path / "cloud.xyz").write_text("\n".join(f"{i} {i % 7} {i % 5}" for i in range(100)), encoding="utf-8")
-    with pytest.raises(InputError, match=r"cloud\.xyz"):
-        SignsBench(shapes=[tmp_path / "cloud.xyz"], config=CONFIG).cells()

@@ -1,6 +1,5 @@
 """The texture benchmark: colours of textured meshes in closed form, image errors, and a small shape end to end."""
 
-import dataclasses
 import json
 import math
 from pathlib import Path
@@ -11,16 +10,14 @@ import pytest
 import torch
 import trimesh
 from mplicits.datasets import Camera, TexturedMesh, linear_to_srgb, look_at, srgb_to_linear
-from mplicits.neural_fields import InputError
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.trace import Seen
 from mplicits.pipelines.training.settings import FitConfig, TextureConfig
 
 from benchmarks.cli import main
 from benchmarks.cli import shapes as bench_shapes
-from benchmarks.harness.report import as_text
 from benchmarks.shapes import texture as bench_texture_fits
-from benchmarks.shapes.compare import Drawing, ImageError, draw, image_error, psnr
+from benchmarks.shapes.compare import Drawing, draw, image_error, psnr
 from benchmarks.shapes.texture import PAPER_MSE, TextureBench, TextureRow
 
 CORNERS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
@@ -68,39 +65,6 @@ def test_between_texels_light_is_interpolated_linearly():
         0.75 * 0.75 * light[1, 1] + 0.25 * 0.75 * light[0, 1] + 0.75 * 0.25 * light[1, 2] + 0.25 * 0.25 * light[0, 2]
     )
     np.testing.assert_allclose(srgb_to_linear(shown)[2, 3], expected, atol=1e-5)
-
-
-def test_a_tilted_square_is_interpolated_in_space_and_not_on_the_screen():
-    turn = trimesh.transformations.rotation_matrix(1.1, [0.0, 1.0, 0.0])[:3, :3]
-    camera = look_at((0.3, 0.4, 3.0), (0.0, 0.0, 0.0), fov=50, width=60, height=40)
-    seen = mesh_view(square(ramp(64), CORNERS @ turn.T), camera)
-    eye, directions = camera.rays(dtype=torch.float64)
-    rays = directions.reshape(-1, 3).numpy() @ turn  # in the square's own axes
-    start = eye.numpy() @ turn
-    hit = start - (start[2] / rays[:, 2])[:, None] * rays
-    inside = (np.abs(hit[:, :2]) < 1).all(axis=1) & (-start[2] / rays[:, 2] > 0)
-    assert inside.sum() > 200
-    assert seen.pixel.tolist() == np.flatnonzero(inside).tolist()
-    np.testing.assert_allclose(seen.position.numpy() @ turn, hit[inside], atol=1e-5)
-    # Nearer to the image's sides than half a texel, the texture repeats.
-    inner = (np.abs(hit[inside, :2]) < 1 - 1 / 64).all(axis=1)
-    assert seen.color is not None
-    light = srgb_to_linear(seen.color.numpy())[inner]
-    np.testing.assert_allclose(light[:, :2], (hit[inside, :2][inner] + 1) / 2, atol=1e-4)
-
-
-def test_the_nearer_of_two_faces_is_seen_and_what_is_behind_the_camera_is_not():
-    ahead = np.array([0.0, 0.0, 1.0])
-    both = np.concatenate((CORNERS, 0.5 * CORNERS + ahead, CORNERS + 5 * ahead))
-    colors = np.repeat(np.eye(3, dtype=np.float32), 4, axis=0)
-    faces = np.concatenate((TRIANGLES, TRIANGLES + 4, TRIANGLES + 8))
-    seen = mesh_view(TexturedMesh(both, faces, vertex_colors=colors), front(40))
-    assert seen.color is not None
-    shown = seen.color.reshape(40, 40, 3).numpy()
-    # The small square, at two thirds of the distance, covers three quarters of the image.
-    expected = np.tile([1.0, 0.0, 0.0], (40, 40, 1))
-    expected[5:35, 5:35] = [0.0, 1.0, 0.0]
-    np.testing.assert_allclose(shown, expected, atol=1e-6)
 
 
 def test_map_coordinates_lose_nothing():
@@ -225,23 +189,6 @@ def test_rows_errors_and_sheet(bench):
     assert sheet.shape == (2 * (48 + 40), 5 * (48 + 12), 3)
 
 
-def test_the_table_prints_the_papers_figures_beside_ours(bench):
-    rows = bench[2]
-    known = dataclasses.replace(rows[0], error=ImageError(0.00329, 0.00823, 0.0658, 7, 6))
-    (table,) = of().tables([known, *rows[1:]], sgemm=1e9)
-    text = as_text(table)
-    assert "0.0329" in text
-    assert "0.00329 (10×)" in text
-    assert "0.00823 (4.0×)" in text
-    assert "0.0658 (0.5×)" in text
-    assert f"{psnr(0.0658):.1f}" in text
-    assert len(text.splitlines()) == 3 + len(rows)
-    unknown = as_text(*of().tables([dataclasses.replace(rows[0], shape="teapot", paper=None)], sgemm=1e9))
-    assert "0.0329" not in unknown
-    assert "×" not in unknown
-    assert rows[0].psnr_either == psnr(rows[0].error.either)
-
-
 def test_what_is_there_is_used_and_what_is_not_is_trained(bench, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
     path, out, rows = bench
@@ -267,22 +214,6 @@ def test_what_is_there_is_used_and_what_is_not_is_trained(bench, tmp_path, monke
     painted = write_ball(tmp_path, image=np.full((4, 4, 3), 0.5))
     assert painted.read_bytes() == path.read_bytes()
     assert of(painted).cells()[0].options != of(path).cells()[0].options
-
-
-def test_two_meshes_of_one_name_are_refused(bench, tmp_path):
-    path, other = bench[0], write_ball(tmp_path)
-    with pytest.raises(InputError, match="spot: two of the meshes are called that"):
-        of(path, other).rows(tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_mesh_without_texture_coordinates_is_refused_before_any_work(tmp_path):
-    ball = trimesh.creation.icosphere(subdivisions=1)
-    ball.visual.vertex_colors = np.full((len(ball.vertices), 4), 200, np.uint8)  # type: ignore[union-attr]
-    ball.export(tmp_path / "ball.ply")
-    with pytest.raises(InputError, match=r"ball.ply: no texture coordinates and image in it"):
-        of(tmp_path / "ball.ply").rows(tmp_path / "out")
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_command(tmp_path, capsys, monkeypatch):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import look_at, read_textured, sample_textured
-from mplicits.neural_fields import MultiscaleSDF, Siren, TextureField, load_field, save_field
+from mplicits.neural_fields import MultiscaleSDF, Siren, TextureField, load_field, map_colors, save_field
 from mplicits.neural_fields.checkpoint import save_texture
 from mplicits.neural_fields.networks.texture import ColorSiren
 from mplicits.pipelines.cli.entry import main
@@ -53,7 +53,7 @@ def test_pixels_have_the_colours_of_the_texture(run, level):
     directory, texture = run
     field = load_field(directory / "field.safetensors").field
     camera = look_at((0.5, 0.8, 3.0), (0, 0, 0), width=40, height=40)
-    seen = trace_view(field, camera, level=level, texture=texture)
+    seen = trace_view(field, camera, level=level, colors=lambda x: map_colors(texture, x).values)
     assert len(seen.pixel) > 200
     torch.testing.assert_close(seen.color, texture.colors(seen.position), atol=1e-5, rtol=0)
     assert trace_view(field, camera, level=level).color is None
@@ -64,7 +64,7 @@ def test_points_outside_the_band_get_the_colour_of_the_surface_below_them(run):
     field = load_field(directory / "field.safetensors").field
     camera = look_at((0.5, 0.8, 3.0), (0, 0, 0), width=24, height=24)
     narrow = TextureField(field, texture.network, delta=1e-7)  # no hit is as near as that
-    seen = trace_view(field, camera, texture=narrow)
+    seen = trace_view(field, camera, colors=lambda x: map_colors(narrow, x).values)
     assert float((seen.color - texture.colors(seen.position)).abs().max()) < 1e-3
 
 

@@ -48,10 +48,3 @@ def test_an_interruption_ends_the_command_with_what_is_kept(stop, options, messa
             except Stopped as stopped:
                 said = str(stopped)
         assert said == message
-
-
-def test_quiet_training_shows_no_bars():
-    with training(quiet=True) as report:
-        assert report is None
-    with training() as report:
-        assert report is not None

@@ -14,7 +14,6 @@ from mplicits.datasets.views.poses.colmap_process import FEATURES
 from mplicits.datasets.views.poses.find_cameras import FoundCameras
 from mplicits.datasets.views.poses.find_points import FoundPoints
 from mplicits.datasets.views.writing import write_colmap
-from mplicits.neural_fields import InputError
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.reconstruct import train
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
@@ -123,17 +122,6 @@ def test_an_interruption_of_the_search_says_how_to_go_on(
     assert main(["reconstruct", "photos", "-o", str(tmp_path / "run"), "--poses", "colmap", *TINY.split()]) == 130
     assert "interrupted; the same command continues" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-
-
-def test_photographs_that_hang_together_badly_are_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def failed(*_: Any, **__: Any) -> None:
-        raise InputError("project: no photographs could be placed")
-
-    monkeypatch.setattr("mplicits.datasets.views.poses.find_cameras.find_cameras", failed)
-    assert main(["find-cameras", "photos", "-o", str(tmp_path / "project"), "--quiet"]) == 2
-    assert capsys.readouterr().err.strip() == "mplicits: error: project: no photographs could be placed"
 
 
 def test_a_scene_has_the_fault_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

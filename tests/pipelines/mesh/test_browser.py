@@ -27,10 +27,7 @@ pytest.importorskip("selenium")
 
 from selenium import webdriver
 
-WINDOW = (
-    "--force-device-scale-factor=1",
-    "--window-size=800,800",
-)
+WINDOW = ("--force-device-scale-factor=1", "--window-size=800,800")
 PATIENCE = 60.0
 SIDE = 400  # pixels
 RADIUS = 0.8  # of the sphere, in units of its similarity

@@ -1,7 +1,5 @@
 """Fewer triangles: how far they are from those before, against distances that are known exactly."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +7,7 @@ from mplicits.neural_fields import Mesh, Sphere, extract_mesh
 
 pytest.importorskip("fast_simplification", reason="the extra mplicits[texture] is not installed")
 
-from mplicits.pipelines.mesh.decimation import Decimation, decimated, deviation
+from mplicits.pipelines.mesh.atlas import decimated, deviation
 
 ROUNDING = 1e-6  # the decimation works in float32, on a mesh of unit size
 
@@ -71,12 +69,3 @@ def test_both_ways_count():
     # Of 11 vertices, 19 + 3 edges and 13 faces of the larger mesh, 3, 3 and 1 are on the tip.
     edges = len(box.edges_unique) + 3
     assert deviation(alone, both) == (pytest.approx(0.4), pytest.approx(0.4 * 7 / (11 + edges + 13) / 2))
-
-
-def test_it_is_said_when_a_mesh_has_come_apart():
-    cost = Decimation(1000, 10, 0.25, 0.1, closed_before=True, closed=False)
-    assert cost.times(4.0).largest == 1.0
-    line = cost.times(4.0).describe("mm")
-    assert "1,000 → 10 faces, at most 1 mm from the full mesh (mean 0.4)" in line
-    assert "NO LONGER WATERTIGHT" in line
-    assert "still watertight" in dataclasses.replace(cost, closed=True).describe("mm")

@@ -8,7 +8,8 @@ import trimesh
 from mplicits.datasets import linear_to_srgb, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere
 from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
-from mplicits.pipelines.mesh.files import check_mesh_path, needs_doubles, write_mesh
+from mplicits.neural_fields.meshing.mesh import needs_doubles
+from mplicits.pipelines.mesh.files import check_mesh_path, write_mesh
 from mplicits.pipelines.surface.surface import read_surface
 
 NEAR = Similarity((1.0, -2.0, 3.0), 2.5)
@@ -120,12 +121,6 @@ def test_bad_path_is_one_line_before_any_work(tmp_path, name, words):
         check_mesh_path(tmp_path / name)
     assert "\n" not in str(error.value)
     assert str(tmp_path / name) in str(error.value)
-
-
-def test_stl_refuses_map_coordinates(tmp_path, mesh):
-    with pytest.raises(InputError, match=r"use \.ply or \.obj"):
-        write_mesh(tmp_path / "mesh.stl", mesh, UTM)
-    assert not list(tmp_path.iterdir())
 
 
 def test_failure_keeps_the_old_file(tmp_path, mesh, monkeypatch):

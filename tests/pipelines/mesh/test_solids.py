@@ -6,20 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from mplicits.neural_fields import (
-    Box,
-    InputError,
-    Mesh,
-    Similarity,
-    Sphere,
-    Union,
-    extract_mesh,
-    load_field,
-    save_field,
-)
+from mplicits.neural_fields import Box, Mesh, Similarity, Sphere, Union, extract_mesh, load_field, save_field
 from mplicits.pipelines.cli import entry as cli
 from mplicits.pipelines.mesh.solids import length_in
-from mplicits.pipelines.surface.solid import MeshField
+from mplicits.pipelines.surface.distance import MeshField
 from mplicits.pipelines.training.trainer import parameter_count
 
 RADIUS, OTHER, APART = 30.0, 25.0, 35.0  # millimetres
@@ -53,11 +43,7 @@ A, B = 4 / 3 * math.pi * RADIUS**3, 4 / 3 * math.pi * OTHER**3
 
 @pytest.mark.parametrize(
     ("operation", "exact"),
-    [
-        ("union", A + B - volume_of_lens()),
-        ("intersection", volume_of_lens()),
-        ("difference", A - volume_of_lens()),
-    ],
+    [("union", A + B - volume_of_lens()), ("intersection", volume_of_lens()), ("difference", A - volume_of_lens())],
 )
 def test_two_balls(balls: Path, operation: str, exact: float) -> None:
     second = "b.stl" if operation == "difference" else "b.safetensors"
@@ -203,8 +189,3 @@ def test_blobs_are_not_joined(tmp_path: Path) -> None:
     assert "removed 1 component " in heard[0]
     assert left.vertices[:, 2].max() < 0.41
     assert left.vertices[:, 0].max() > 0.89
-
-
-def test_a_length_is_no_word() -> None:
-    with pytest.raises(InputError, match="--by two"):
-        length_in("two", "mm", "--by")

@@ -122,12 +122,6 @@ def test_planes_and_convex_shapes_are_open(reach):
     torch.testing.assert_close(openness, torch.ones(50))
 
 
-@pytest.mark.parametrize("height", [-0.01, 0.01])
-def test_a_level_that_lies_elsewhere_is_open_too(height):
-    points, normals = on_plane((0, 0), (0.4, 0.1))
-    torch.testing.assert_close(ambient_occlusion(Plane(offset=height), points, normals), torch.ones(2))
-
-
 def test_a_corner_darkens_with_nearness_and_with_reach():
     corner = Union(Plane(), Plane(normal=(1, 0, 0)))  # free where x > 0 and z > 0
     away = torch.tensor([0.01, 0.03, 0.1, 0.3])

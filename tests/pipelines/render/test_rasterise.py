@@ -6,11 +6,7 @@ import torch
 import trimesh
 from mplicits.datasets import Camera, look_at, orbit
 from mplicits.neural_fields import Mesh
-from mplicits.pipelines.render.rasterise import (
-    cloud_view,
-    mesh_view,
-    picture_of,
-)
+from mplicits.pipelines.render.rasterise import cloud_view, mesh_view, picture_of
 from mplicits.pipelines.render.shade import LAMPS, ShadeOptions
 from mplicits.pipelines.surface.raster import clip
 

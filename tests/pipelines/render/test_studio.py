@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, scene_mesh
-from mplicits.neural_fields import InputError, Mesh, Similarity
+from mplicits.neural_fields import Mesh, Similarity
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render.rasterise import read_painted
 from mplicits.pipelines.render.studio import CLAY, photograph_mesh, true_mesh
@@ -122,9 +122,3 @@ def test_materials_that_are_missing_are_left_out(quad: Path) -> None:
     assert isinstance(mesh, Mesh)
     assert len(mesh.faces) == 2
     assert len(true_mesh(quad).faces) == 2
-
-
-def test_a_cloud_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "cloud.xyz").write_text("".join(f"{k} {k * k} {k % 3}\n" for k in range(20)))
-    with pytest.raises(InputError, match=r"cloud.xyz: has no faces, so there is no surface to photograph; give a mesh"):
-        photograph_mesh(tmp_path / "cloud.xyz")

@@ -1,6 +1,5 @@
 """Figures between surfaces, checked where the exact answer is known."""
 
-import json
 import math
 
 import numpy as np
@@ -14,7 +13,6 @@ from mplicits.pipelines.surface.measure import (
     format_metrics,
     overlap,
     shell_iou,
-    write_metrics,
 )
 from mplicits.pipelines.surface.raster import cover
 from mplicits.pipelines.surface.surface import components, is_closed, read_surface, sample_points
@@ -198,15 +196,6 @@ def test_columns_are_those_that_a_test_of_all_finds(places):
     assert len(expected) > 20 or places == "in line"
 
 
-def test_small_chunks_cover_the_same_columns():
-    rng = np.random.default_rng(3)
-    xy, faces = rng.uniform(-5, 40, (60, 2)), rng.integers(0, 60, (50, 3))
-    whole = np.concatenate([np.stack((c.face, c.column)) for c in cover(xy, faces, (32, 40))], axis=1)
-    parts = [np.stack((c.face, c.column)) for c in cover(xy, faces, (32, 40), chunk=100)]
-    assert len(parts) > 10
-    np.testing.assert_array_equal(np.concatenate(parts, axis=1), whole)
-
-
 # --- counting ----------------------------------------------------------------------------------------
 
 
@@ -278,23 +267,6 @@ def test_unusable_files_are_one_line(tmp_path, name, content, message):
         read_surface(tmp_path / name)
     assert "\n" not in str(caught.value)
     assert name in str(caught.value)
-
-
-def test_the_table_and_the_json_hold_the_figures(tmp_path):
-    metrics = evaluate_surfaces(sphere(0.9, 3), sphere(1.0, 3), samples=1_000, columns=32)
-    text = format_metrics(metrics)
-    assert f"{metrics.chamfer:.3e}" in text
-    assert f"{metrics.iou:.4f}" in text
-    write_metrics(tmp_path / "figures.json", metrics)
-    written = json.loads((tmp_path / "figures.json").read_text())
-    assert written["chamfer"] == metrics.chamfer
-    assert written["components"] == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]
-
-
-def test_samples_must_be_positive():
-    with pytest.raises(ValueError, match="samples=0"):
-        evaluate_surfaces(box(), box(), samples=0)
 
 
 def test_what_no_photograph_sees_does_not_count() -> None:

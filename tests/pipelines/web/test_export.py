@@ -132,7 +132,6 @@ def test_mistakes_are_one_line(run, tmp_path, capsys):
         (run, "-o", tmp_path / "page.png"): "unknown extension",
         (run, "-o", foreign): "no page of this command",
         (tmp_path / "none", "-o", out): "no such file",
-        (run, "-o", out, "--no-highlights"): "--no-highlights: pages",
         (moving, "-o", out, "--cloud", foreign): "--cloud",
         (run, "-o", out, "--levels", 3): "has levels 0 to 1",
         (run, "-o", out, "--time", 0.5): "does not move",

@@ -7,15 +7,8 @@ import numpy as np
 import pytest
 import torch
 from fields import small_multiscale
-from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere
-from mplicits.pipelines.web.payload import (
-    Payload,
-    network_layers,
-    pack_codes,
-    rounded_field,
-    rounding_error,
-    shader_levels,
-)
+from mplicits.neural_fields import Siren
+from mplicits.pipelines.web.payload import Payload, network_layers, pack_codes, rounded_field, rounding_error
 
 
 def evaluate(layers, points):
@@ -67,10 +60,6 @@ def test_the_error_that_is_stated_is_that_of_the_rounded_field():
     assert all(
         after.value < before.value for before, after in zip(rough, rounding_error(field, 12, points), strict=True)
     )
-
-
-def test_a_level_that_is_no_siren_has_no_shader():
-    assert shader_levels(MultiscaleSDF(Sphere(radius=0.5), [Siren(8, 1)], [0.1])) is None
 
 
 @pytest.mark.parametrize("bits", [2, 5, 8, 13, 16, 24])

@@ -49,21 +49,6 @@ def test_a_script_waits_until_the_page_is_closed() -> None:
     until_closed(interrupted)  # no traceback
 
 
-def test_nobody_there_for_a_moment_is_not_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter(range(100))
-    monkeypatch.setattr(window.time, "monotonic", lambda: next(clock))
-    monkeypatch.setattr(window.time, "sleep", lambda _: None)
-    counts, asked = [0, 1, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0], []
-
-    def clients() -> int:
-        asked.append(counts[len(asked)])
-        return asked[-1]
-
-    until_closed(clients, gone=4)
-    assert asked[:4] == [0, 1, 0, 1]
-    assert 6 <= len(asked) <= 9
-
-
 def test_the_page_of_a_script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
