@@ -90,6 +90,9 @@ def test_a_sphere_and_a_plate_thinner_than_its_spacing_have_no_noise(radius):
     for points, normals in (plate(4000, thickness=0.005), sphere(3000, radius=radius)):
         assert noise_level(points, normals) == noise_deviation(points, normals) == 0
     assert np.abs(smooth_along_normals(points, normals, 0.02 * radius) - points).max() < 16 * DOUBLE
+    few, normals = sphere(12)
+    assert noise_level(few, normals) == 0
+    assert np.isfinite(smooth_along_normals(few, normals, 0.1)).all()
 
 
 @pytest.mark.parametrize(("count", "amplitude"), [(8000, 0.02), (8000, 0.04), (60000, 0.02)])
@@ -204,12 +207,6 @@ def test_it_does_not_depend_on_where_or_how_large_the_cloud_is():
     assert noise_level(there, normals_there) == pytest.approx(7 * level, rel=1e-9)
     moved = smooth_along_normals(noisy, normals, level)
     assert smooth_along_normals(there, normals_there, 7 * level) == pytest.approx(7 * moved @ turn.T + 2, abs=1e-9)
-
-
-def test_a_few_points_are_left_alone():
-    points, normals = sphere(12)
-    assert noise_level(points, normals) == 0
-    assert np.isfinite(smooth_along_normals(points, normals, 0.1)).all()
 
 
 @pytest.mark.parametrize("strays", [0.0, 0.05])
@@ -344,9 +341,9 @@ def test_filtered_normals_are_means_over_a_face():
 def test_a_box_has_edges_and_a_sphere_has_none():
     points, _, noisy = box_with_normals(6000)
     assert has_edges(points, filter_normals(points, noisy))
-    sphere = sample_sphere(6000)
-    assert not has_edges(sphere.points, 2 * sphere.points)
-    assert not has_edges(sphere.points, filter_normals(sphere.points, 2 * sphere.points))
+    points, exact = even_sphere(6000)
+    assert not has_edges(points, exact)
+    assert not has_edges(points, filter_normals(points, exact))
 
 
 @pytest.mark.slow
@@ -362,29 +359,26 @@ def test_noise_on_a_box_comes_off_and_leaves_its_edges():
     half = np.array([0.6, 0.5, 0.4])
     outside = np.linalg.norm((np.abs(moved) - half).clip(min=0), axis=1)
     off = np.where(outside > 0, outside, (half - np.abs(moved)).min(axis=1))
-    assert np.sqrt(np.square(off).mean()) < sigma / 3
+    assert rms(off) < sigma / 3
     assert np.median(angles(normals, exact)) < 2
 
 
 @pytest.mark.slow
 def test_noise_equal_in_all_directions_is_taken_off_points_and_normals():
-    sphere = sample_sphere(12000)
-    exact, sigma = 2 * sphere.points, 0.01
-    noisy = sphere.points + RNG.normal(0, sigma, (12000, 3))
+    (points, exact), sigma = even_sphere(12000), 0.01
+    noisy = points + RNG.normal(0, sigma, points.shape)
     first = unit_rows(exact + RNG.normal(0, 0.2, exact.shape))  # eleven degrees off along each axis
     moved, normals, level = denoise(noisy, first)
     assert level == pytest.approx(sigma, rel=0.3)
     assert np.median(angles(normals, exact)) < np.median(angles(first, exact)) / 2
-    left = np.linalg.norm(moved, axis=1) - 0.5
-    assert np.sqrt((left**2).mean()) < 0.4 * sigma
+    assert rms(np.linalg.norm(moved, axis=1) - 0.5) < 0.4 * sigma
 
 
 def test_without_noise_nothing_changes():
-    sphere = sample_sphere(3000)
-    exact = 2 * sphere.points
-    moved, normals, level = denoise(sphere.points, exact)
+    points, exact = even_sphere(3000)
+    moved, normals, level = denoise(points, exact)
     assert level == 0
-    assert moved is sphere.points
+    assert moved is points
     assert normals is exact
 
 
@@ -412,11 +406,13 @@ def test_normals_of_slightly_noisy_points_stay():
     assert (left.normals == given.normals).all()
 
 
-def test_exact_normals_of_a_sphere_are_not_worse_with_or_without_noise():
+def test_exact_normals_are_not_worse_and_those_of_few_points_not_compared():
     points, exact = even_sphere()
     assert not worse_normals(points, exact, 0.0).any()
     noisy = points + np.random.default_rng(3).normal(0, 0.01, points.shape)
     assert not worse_normals(noisy, exact, layer_level(noisy, exact)).any()
+    assert not worse_normals(points[::100], jittered(exact[::100], 0.5), 0.0).any()
+    assert layer_level(points, jittered(exact, 0.6)) == 0  # noise of the normals, not of the points
 
 
 @pytest.mark.parametrize(
@@ -432,11 +428,6 @@ def test_exact_normals_are_kept_as_they_are(cloud):
     prepared = prepare_cloud(cloud, smooth_noise=True)
     assert prepared.report.reestimated_normals == 0
     assert np.abs(prepared.normals - cloud.normals).max() < 1e-6
-
-
-def test_noise_of_normals_is_no_noise_of_points():
-    points, exact = even_sphere()
-    assert layer_level(points, jittered(exact, 0.6)) == 0
 
 
 @pytest.mark.parametrize("tilt", [0.15, 0.3])
@@ -463,8 +454,3 @@ def test_normals_and_points_that_are_both_noisy_are_mended_together():
     prepared = prepare_cloud(PointCloud(noisy, tilted.astype(np.float32)), smooth_noise=True)
     assert prepared.report.reestimated_normals == 4000
     assert mean_square(prepared.normals, exact) < mean_square(tilted, exact) / 4
-
-
-def test_normals_of_a_few_points_are_not_compared():
-    points, exact = even_sphere(40)
-    assert not worse_normals(points, jittered(exact, 0.5), 0.0).any()
