@@ -100,6 +100,7 @@ class LevelObjective(Objective):
             best = {BEST + name: tensor.clone() for name, tensor in siren.state_dict().items()}
             self.kept = {
                 "looks": torch.zeros(1),
+                "hopeless": torch.zeros(1),
                 "least": torch.full((1,), math.inf),
                 "at": torch.ones(1),
                 **best,
@@ -136,12 +137,20 @@ class LevelObjective(Objective):
         if self.judge is None:
             return
         self.kept["looks"].fill_(int(done * JUDGE.looks))
-        loss = self.judge.errors(self.siren).mean().loss
+        errors = self.judge.errors(self.siren)
+        loss = errors.mean().loss
+        if done >= JUDGE.hopeless and max(self.judge.verdict(errors, done).fall) < -JUDGE.surely:
+            self.kept["hopeless"].fill_(1)
         if loss < float(self.kept["least"]):
             self.kept["least"].fill_(loss)
             self.kept["at"].fill_(done)
             for name, tensor in self.siren.state_dict().items():
                 self.kept[BEST + name].copy_(tensor)
+
+    @property
+    def hopeless(self) -> bool:
+        """See `Objective.hopeless`: whether held-out points say for sure that the level makes everything worse."""
+        return self.judge is not None and bool(self.kept["hopeless"])
 
     def take_best(self) -> Verdict | None:
         """Look once more, and go back to the best weights if they are surely better → what was found; None without.
