@@ -1,8 +1,7 @@
-"""Clouds of many millions of points in bounded memory: points of one voxel with like normals become their mean.
+"""Clouds of many millions of points in bounded memory: points of a voxel with like normals become their mean.
 
-The points of a voxel with the same dominant normal direction (one of ±x, ±y, ±z) are averaged, so the two sides of a
-thin sheet stay apart. Planes stay exactly; a curved surface moves by less than a tenth of the voxel squared times its
-curvature. Where noise is wider than a voxel, voxels that follow each other along that direction count as one.
+Like is the dominant direction of ±x, ±y, ±z: the two sides of a thin sheet stay apart. Planes stay exactly; a curved
+surface moves by less than a tenth of the voxel squared times its curvature.
 """
 
 from __future__ import annotations
@@ -17,11 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from .point_cloud import PointCloud, begins, color_scale, colors_from, normals_from, unit_rows, usable_rows
+from .cleaning.orientation import query
+from .point_cloud import (
+    Float64,
+    Int64,
+    PointCloud,
+    begins,
+    color_scale,
+    colors_from,
+    normals_from,
+    unit_rows,
+    usable_rows,
+)
 from .readers.columns import CloudStream
-
-Float64 = NDArray[np.float64]
-Keys = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -30,7 +37,7 @@ class MergeOptions:
 
     rows: int = 1 << 19  # points read at once; with intermediate arrays about 200 MiB
     sample: int = 200_000  # points from which the size of the voxels is estimated
-    bits: int = 20  # of a cell number; three of them and one of seven directions fill an int64
+    bits: int = 20  # of a cell number; three of them and one of seven directions fit an int64
     run: int = 16  # largest number of voxels along a normal that are merged
     nowhere: int = 6  # the direction of a point without a normal
 
@@ -58,7 +65,7 @@ class Merging:
 
 
 class _Survey(NamedTuple):
-    """The bounds of a cloud, and what it stores."""
+    """The bounds of a cloud, and which columns it has."""
 
     low: Float64  # (3,) lowest corner of the finite points
     extent: float  # longest side of their box
@@ -72,7 +79,7 @@ class _Survey(NamedTuple):
 class _Groups(NamedTuple):
     """Sums over the points of a voxel that face one way."""
 
-    keys: Keys  # (n,), ascending: three cell numbers and a direction
+    keys: Int64  # (n,), ascending: three cell numbers and a direction
     sums: Float64  # (n, 7 or 10): count, offsets from the lowest corner, unit normals, colours if there are any
 
 
@@ -81,8 +88,8 @@ def merge_cloud(
 ) -> tuple[PointCloud, Merging] | None:
     """At most ``limit`` means of the points of a stream, which is read twice; None if all points coincide.
 
-    Points with less than 1 / ``isolation`` of the usual number of points in the 27 voxels around them are dropped: they
-    would weigh as much as means of many. ``voxel`` is the edge in input units, if smaller than ``limit`` suggests.
+    Points with less than 1 / ``isolation`` of the median number of points in the 27 voxels around them are dropped:
+    they would weigh as much as means of many. ``voxel`` is the first edge in input units; None for one by ``limit``.
     """
     if limit < 1:
         raise ValueError(f"limit={limit}: expected at least one")
@@ -136,14 +143,11 @@ def _survey(stream: CloudStream) -> _Survey:
     return _Survey(low, extent, finite, np.concatenate(samples) - low, normals, scale, read)
 
 
-def _first_size(frame: _Survey, limit: int, *, each: int = 20) -> float:
-    """Edge of the voxels of which a surface meets about half of ``limit``.
-
-    With ``each`` points of the sample per cell, nearly all cells of the surface are found. Their number is proportional
-    to one over their edge squared.
-    """
+def _first_size(frame: _Survey, limit: int) -> float:
+    """The edge of voxels of which a surface meets about half of ``limit``; their number goes as one over it squared."""
     size, found = frame.extent, 1
-    while found * each < len(frame.sample) and size > frame.extent / 2**MERGE.bits:
+    # With 20 points of the sample per cell, nearly all cells of the surface are found.
+    while found * 20 < len(frame.sample) and size > frame.extent / 2**MERGE.bits:
         size /= 2
         found = len(np.unique(_cell_keys(frame.sample, size)))
     return size * math.sqrt(found / (0.5 * limit))
@@ -178,20 +182,20 @@ def _pieces(stream: CloudStream, frame: _Survey) -> Iterator[tuple[Float64, Floa
         yield points[finite] - frame.low, normals, colors
 
 
-def _cell_keys(offsets: Float64, size: float) -> Keys:
+def _cell_keys(offsets: Float64, size: float) -> Int64:
     """One number per cell: three of ``bits`` bits each."""
     x, y, z = (np.floor(axis / size).astype(np.int64) for axis in offsets.T)
     return (x << MERGE.bits | y) << MERGE.bits | z
 
 
-def _directions(normals: Float64) -> Keys:
+def _directions(normals: Float64) -> Int64:
     """0 to 5 for normals closest to +x, −x, +y, −y, +z, −z; `nowhere` for a normal of no length: ``(n,)``."""
     axis = np.abs(normals).argmax(axis=1)
     along = np.take_along_axis(normals, axis[:, None], axis=1)[:, 0]
     return np.where(along == 0, MERGE.nowhere, 2 * axis + (along < 0))
 
 
-def _summed(keys: Keys, values: Float64) -> _Groups:
+def _summed(keys: Int64, values: Float64) -> _Groups:
     """Add up the rows with equal keys."""
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
@@ -201,7 +205,7 @@ def _summed(keys: Keys, values: Float64) -> _Groups:
     return _Groups(ordered[starts], np.add.reduceat(values[order], starts, axis=0))
 
 
-def _cells(keys: Keys) -> tuple[Keys, Keys, Keys]:
+def _cells(keys: Int64) -> tuple[Int64, Int64, Int64]:
     mask = (1 << MERGE.bits) - 1
     return keys >> (3 + 2 * MERGE.bits) & mask, keys >> (3 + MERGE.bits) & mask, keys >> 3 & mask
 
@@ -213,7 +217,7 @@ def _coarser(groups: _Groups) -> _Groups:
 
 
 def _along_normals(groups: _Groups) -> Float64:
-    """Join voxels that follow each other along the axis that their points face → sums, as in `_Groups`."""
+    """Sums as in `_Groups`, of voxels joined along the axis that their points face: noise may be wider than one."""
     direction, cells = groups.keys & 7, _cells(groups.keys)
     joined = [groups.sums[direction == MERGE.nowhere]]
     for axis in range(3):
@@ -232,11 +236,10 @@ def _along_normals(groups: _Groups) -> Float64:
     return np.concatenate(joined)
 
 
-def _without_scraps(rows: Float64, size: float, *, share: float = 1 / 4, neighbors: int = 8) -> Float64:
-    """Add rows with few points, at the rims of noise and between two directions, to rows with many near them.
+def _without_scraps(rows: Float64, size: float, *, share: float = 1 / 4) -> Float64:
+    """Rows with less than ``share`` of the points of a row within two voxels that faces the same way, added to that.
 
-    Rows with less than ``share`` of the points of one within two voxels that faces the same way are added to it: a mean
-    of few points would weigh as much as a mean of many.
+    They occur at the rims of noise and between two directions, and would weigh as much as means of many points.
     """
     count = rows[:, 0]
     few = count < share * np.median(count)
@@ -245,10 +248,7 @@ def _without_scraps(rows: Float64, size: float, *, share: float = 1 / 4, neighbo
     small, large = rows[few], rows[~few]
     normals = unit_rows(large[:, 4:7])
     tree = KDTree(large[:, 1:4] / large[:, :1])
-    found, near = tree.query(
-        small[:, 1:4] / small[:, :1], k=min(neighbors, len(large)), distance_upper_bound=2 * size, workers=-1
-    )
-    found, near = found.reshape(len(small), -1), near.reshape(len(small), -1)
+    found, near = query(tree, small[:, 1:4] / small[:, :1], 8, within=2 * size)
     near = np.where(np.isfinite(found), near, 0)
     agrees = np.einsum("mkd,md->mk", normals[near], unit_rows(small[:, 4:7])) > 0.5
     agrees |= (small[:, 4:7] == 0).all(axis=1)[:, None]
@@ -264,8 +264,7 @@ def _without_isolated(groups: _Groups, factor: float) -> _Groups:
     """Drop voxels with too few points in and around them; see `merge_cloud`."""
     voxels = _summed(groups.keys >> 3, groups.sums[:, :1])
     counts = voxels.sums[:, 0]
-    # A surface crosses about nine of the 27 voxels around one of its points.
-    usual = 9 * float(np.median(counts))
+    usual = 9 * float(np.median(counts))  # a surface crosses about nine of the 27 voxels around one of its points
     few = np.flatnonzero(counts * factor < usual)
     around = np.zeros(len(few))
     for x in (-1, 0, 1):

@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...datasets import PointCloud, read_cloud
-from ...datasets.clouds.cleaning.dipoles import DipoleField
+from ...datasets.clouds.cleaning.winding import DipoleField
 from ...datasets.clouds.large import Merging, merge_cloud
 from ...datasets.clouds.readers.columns import CloudStream, MemoryStream
 from ...datasets.clouds.readers.reading import check_cloud, open_stream

@@ -29,10 +29,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets import OrientedCloud
-from ...datasets.clouds.cleaning.exterior import OUTER_REGION, Exterior
-from ...datasets.clouds.cleaning.noise import noise_deviation
-from ...datasets.clouds.cleaning.orientation import settle_signs
-from ...datasets.clouds.cleaning.reestimate import denoise
+from ...datasets.clouds.cleaning.noise import denoise, noise_deviation
+from ...datasets.clouds.cleaning.orientation import OUTER_REGION, Exterior, settle_signs
 from ...datasets.clouds.cleaning.winding import WINDING
 from ...datasets.clouds.point_cloud import spread
 from ...neural_fields import Siren

@@ -1,75 +1,87 @@
-"""Normals of an unoriented cloud: directions by local planes, signs by propagation over a spanning tree.
-
-Directions are those of Hoppe et al., "Surface reconstruction from unorganized points" (SIGGRAPH 1992, section 3.2),
-and so is the spanning tree; signs pass along its edges by the reflection rule of König and Gumhold, "Consistent
-propagation of normal orientations in point clouds" (VMV 2009), which also gets past sharp edges and thin sheets.
-"""
+"""Normals of unoriented clouds by planes (Hoppe et al., SIGGRAPH 1992) and signs, and the space outside a cloud."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import cg
 from scipy.spatial import KDTree
 
-__all__ = [
-    "estimate_normals",
-    "fibonacci_directions",
-    "fit_planes",
-    "nearest",
-    "openness",
-    "orient_normals",
-    "outwardness",
-    "settle_signs",
-]
-
-Float64 = NDArray[np.float64]
-Index = NDArray[np.int64]
+from ..point_cloud import Float64, Int64
 
 # An offset from the tangent plane within this many standard deviations counts as noise, not shape. Measured: 0 fails
-# on clouds with noise (signs of the Armadillo with 1 % noise no better than a coin), 3 on thin parts (Eiffel tower).
+# on clouds with noise (half of the signs of the Armadillo with 1 % noise are wrong), 3 on thin parts (Eiffel tower).
 _NOISE_WIDTHS = 1.0
-# Agreements of neighbours count with this power: at an edge, or across a thin part, they are in doubt.
-_POWER = 8
+_POWER = 8  # of the agreement of neighbours: at an edge, or across a thin part, it is uncertain
+_BLOCK = 1 << 16  # points handled at once, to bound memory
+
+OUTER_REGION = 1  # number of the region that contains infinity, see `Exterior`
 
 
-def estimate_normals(points: Float64, neighbors: Index, *, block: int = 65536) -> tuple[Float64, Float64]:
-    """Fit a plane to every point's neighbourhood.
+@dataclass(frozen=True)
+class ExteriorOptions:
+    """The grid around a cloud in the unit sphere; lengths in spacings of the points."""
 
-    Args:
-        points: ``(N, 3)``.
-        neighbors: ``(N, k)`` indices of the nearest points, the point itself among them.
-        block: rows handled at once, to bound memory.
+    resolution: int = 128  # cells along an edge
+    half: float = 1.15  # half edge of the grid, in radii of the sphere
+    wall: float = 1.5  # largest distance from a point to a cell of the surface
+    gate: float = 2.5  # half width of a gap that joins two regions; one uniform point in e^(π r²) has such a gap
+    neighbors: int = 8  # from whose distances the spacing at a point follows
+    fewest: int = 500  # cells of a region
 
-    Returns:
-        Unit normals ``(N, 3)`` of arbitrary sign, and the standard deviation ``(N,)`` from the plane.
+
+EXTERIOR = ExteriorOptions()
+
+
+def query(tree: KDTree, places: Float64, count: int, *, within: float = np.inf) -> tuple[Float64, Int64]:
+    """Distances ``(M, k)`` from places ``(M, 3)`` to their k nearest points of a tree, ascending, and their indices.
+
+    k is ``count``, or the number of points if that is less. Beyond ``within``, the distance is inf and the index N.
     """
+    ranks: Any = np.arange(1, min(count, tree.n) + 1)  # unlike a number, they give two axes even for one neighbour
+    distance, index = tree.query(places, k=ranks, distance_upper_bound=within, workers=-1)
+    return np.asarray(distance), np.asarray(index, np.int64)
+
+
+def nearest(points: Float64, count: int) -> Int64:
+    """Indices ``(N, count)`` of each point's nearest points, itself first."""
+    return query(KDTree(points), points, count)[1]
+
+
+def blocks(rows: Int64, size: int) -> Iterator[Int64]:
+    """Consecutive parts of ``rows``, of ``size`` at most, to bound memory."""
+    for start in range(0, len(rows), size):
+        yield rows[start : start + size]
+
+
+def estimate_normals(points: Float64, neighbors: Int64) -> tuple[Float64, Float64]:
+    """Unit normals ``(N, 3)`` of any sign and deviations ``(N,)`` of planes through neighbourhoods ``(N, k)``."""
     normals, spread = np.empty_like(points), np.empty(len(points))
-    for start in range(0, len(points), block):
-        near = points[neighbors[start : start + block]]  # (B, k, 3)
-        normals[start : start + block], spread[start : start + block] = fit_planes(near)
+    for part in blocks(np.arange(len(points)), _BLOCK):
+        normals[part], spread[part] = fit_planes(points[neighbors[part]])
     return normals, spread
 
 
 def fit_planes(near: Float64) -> tuple[Float64, Float64]:
-    """Unit normals ``(B, 3)`` of the planes through sets of points ``(B, k, 3)``, and the deviations from them."""
+    """Unit normals ``(B, 3)`` of the planes through sets of points ``(B, k, 3)``, and standard deviations ``(B,)``."""
     near = near - near.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(near.transpose(0, 2, 1) @ near / near.shape[1])  # ascending
     return vectors[:, :, 0], np.sqrt(values[:, 0].clip(min=0))
 
 
-def orient_normals(points: Float64, normals: Float64, spread: Float64, neighbors: Index) -> tuple[Float64, int]:
-    """Give ``normals`` ``(N, 3)`` consistent signs, outward.
+def orient_normals(points: Float64, normals: Float64, spread: Float64, neighbors: Int64) -> tuple[Float64, int]:
+    """``normals`` ``(N, 3)`` with consistent outward signs, and the number of connected pieces.
 
-    Signs pass along the minimum spanning tree of the neighbour graph with edge weights 1 - |c|, where
-    c = ⟨n_i, n_j⟩ - 2⟨e, n_i⟩⟨e, n_j⟩/|e|² compares n_j with n_i reflected to j's side of the edge e. Offsets
-    ⟨e, n⟩ within the noise ``spread`` ``(N,)`` count as zero, which leaves Hoppe's 1 - |⟨n_i, n_j⟩|. Then each
-    connected piece is turned outward as a whole (see :func:`outwardness`).
-
-    Returns:
-        The oriented normals, and the number of connected pieces.
+    Signs pass along the minimum spanning tree of edge weights 1 − |c|, with c of `_agreement`. It holds at sharp edges
+    and in thin sheets (König and Gumhold, "Consistent propagation of normal orientations in point clouds", VMV 2009).
+    Offsets within the noise ``spread`` ``(N,)`` count as zero. Pieces are turned by `outwardness`.
     """
     count, k = neighbors.shape
     rows, columns = np.repeat(np.arange(count), k - 1), neighbors[:, 1:].ravel()
@@ -87,28 +99,20 @@ def orient_normals(points: Float64, normals: Float64, spread: Float64, neighbors
             break
         sign, parent = sign * sign[parent], grandparent
     oriented = normals * sign[:, None]
-    return oriented * _piece_signs(points, oriented, pieces, piece)[piece][:, None], int(pieces)
+    order = np.argsort(piece, kind="stable")
+    for members in np.split(order, np.cumsum(np.bincount(piece, minlength=pieces))[:-1]):
+        if outwardness(points[members], oriented[members])[0] < 0:
+            oriented[members] *= -1
+    return oriented, int(pieces)
 
 
 def settle_signs(
     points: Float64, normals: Float64, evidence: Float64, *, neighbors: int = 12, weight: float = 0.2
 ) -> Float64:
-    """Signs of ``normals`` ``(N, 3)`` that follow evidence where it is strong, and the neighbours where it is weak.
+    """Signs ±1 ``(N,)`` of normals by evidence ``(N,)``, positive for the present sign, and where weak by neighbours.
 
-    They are those of the minimum of ``Σ_ij |c_ij|^8 (s_i − sgn(c_ij) s_j)² + λ Σ_i |e_i| (s_i − sgn(e_i))²`` over
-    neighbours i and j, c being what `orient_normals` passes signs on by and e the evidence in units of its median: a
-    random walk from point to point that ends where evidence is met (Grady, "Random walks for image segmentation",
-    2006).
-
-    Args:
-        points: ``(N, 3)``.
-        normals: ``(N, 3)`` unit normals.
-        evidence: ``(N,)`` positive where the normal's sign looks right.
-        neighbors: of each point.
-        weight: λ.
-
-    Returns:
-        ``(N,)`` 1 or −1.
+    Minimises ``Σ_ij |c_ij|^8 (s_i − sgn(c_ij) s_j)² + λ Σ_i |e_i| (s_i − sgn(e_i))²``, with c of `_agreement`, λ =
+    ``weight`` and e in units of its median (Grady, "Random walks for image segmentation", 2006).
     """
     count, size = len(points), min(neighbors + 1, len(points))
     near = nearest(points, size)
@@ -124,14 +128,10 @@ def settle_signs(
 
 
 def outwardness(points: Float64, normals: Float64, *, directions: int = 64, cap: float = 0.1) -> tuple[float, float]:
-    """How far ``normals`` ``(N, 3)`` point out of the body that ``points`` ``(N, 3)`` bound.
+    """Mean over directions d of Σ⟨n, d⟩ / Σ|⟨n, d⟩|, in [-1, 1], and the fraction of negative ones.
 
-    By the divergence theorem the area-weighted normals of a closed surface's part beyond any plane add up to
-    the area of the cut, facing away from the body. For each of many directions d the fraction ``cap`` of the
-    points that lies furthest along d is such a part; its score is Σ⟨n, d⟩ / Σ|⟨n, d⟩|, in [-1, 1].
-
-    Returns:
-        The mean score, and the fraction of directions with a negative one.
+    Sums are over the fraction ``cap`` of the points furthest along d. By the divergence theorem the outward normals of
+    such a part of a closed surface add up to a positive multiple of d.
     """
     points, normals = points[:: 1 + len(points) // 100_000], normals[:: 1 + len(normals) // 100_000]
     taken = max(1, int(cap * len(points)))
@@ -143,18 +143,13 @@ def outwardness(points: Float64, normals: Float64, *, directions: int = 64, cap:
     return float(scores.mean()), float((scores < 0).mean())
 
 
-def openness(points: Float64, normals: Float64, *, neighbors: int = 9) -> float:
+def openness(points: Float64, normals: Float64) -> float:
     """``|Σ a n| / Σ a``: 0 for a closed surface, 1 for a flat sheet; a hole counts with its area.
 
-    The area a of a point is that of the disc out to its last neighbour, up to a factor.
-
-    Args:
-        points: ``(N, 3)``; of more than 50,000 an even selection is used.
-        normals: ``(N, 3)``, of unit length.
-        neighbors: of each point, itself included.
+    The area a of a point is that of the disc out to its eighth neighbour, up to a factor.
     """
     points, normals = points[:: 1 + len(points) // 50_000], normals[:: 1 + len(normals) // 50_000]
-    last = nearest(points, neighbors)[:, -1]
+    last = nearest(points, 9)[:, -1]
     area = ((points[last] - points) ** 2).sum(axis=1)
     return float(np.linalg.norm(area @ normals) / area.sum())
 
@@ -167,7 +162,7 @@ def fibonacci_directions(count: int) -> Float64:
     return np.stack((ring * np.cos(angle), ring * np.sin(angle), z), axis=1)
 
 
-def _agreement(points: Float64, normals: Float64, spread: Float64, i: Index, j: Index) -> Float64:
+def _agreement(points: Float64, normals: Float64, spread: Float64, i: Int64, j: Int64) -> Float64:
     """⟨n_i, n_j⟩ − 2⟨e, n_i⟩⟨e, n_j⟩/|e|² of pairs of neighbours: 1 if their signs agree on any arc, −1 if not."""
     edge = points[j] - points[i]
     width = _NOISE_WIDTHS * np.maximum(spread[i], spread[j])
@@ -181,7 +176,7 @@ def _shrink(offset: Float64, width: Float64) -> Float64:
     return np.sign(offset) * (np.abs(offset) - width).clip(min=0)
 
 
-def _parents(tree: csr_array, pieces: int, piece: NDArray[np.int32]) -> Index:
+def _parents(tree: csr_array, pieces: int, piece: NDArray[np.int32]) -> Int64:
     """Each point's parent ``(N,)`` in the forest ``tree``; a root is its own parent."""
     count = len(piece)
     roots = np.unique(piece, return_index=True)[1]
@@ -194,17 +189,45 @@ def _parents(tree: csr_array, pieces: int, piece: NDArray[np.int32]) -> Index:
     return np.where(above == count, np.arange(count), above)
 
 
-def _piece_signs(points: Float64, normals: Float64, pieces: int, piece: NDArray[np.int32]) -> Float64:
-    """+1 or -1 for each piece ``(pieces,)``."""
-    signs = np.ones(pieces)
-    order = np.argsort(piece, kind="stable")
-    for index, members in enumerate(np.split(order, np.cumsum(np.bincount(piece, minlength=pieces))[:-1])):
-        if outwardness(points[members], normals[members])[0] < 0:
-            signs[index] = -1
-    return signs
+class Exterior:
+    """Connected regions of the space around a cloud ``(N, 3)`` in the unit sphere, on a grid; normals are not used.
+
+    Cells within `wall` spacings of a point are the surface; `count` others are regions of `fewest` cells or more. A
+    hole of the scan that is wider than the gate joins the inside to the outside.
+    """
+
+    def __init__(self, points: Float64) -> None:
+        resolution = EXTERIOR.resolution
+        self.cell = 2 * EXTERIOR.half / resolution
+        distance, near = query(KDTree(points), points, EXTERIOR.neighbors + 1)
+        reach = distance[:, -1][near].max(axis=1)  # a point beside a gap takes the spacing of its neighbours
+        spacing = np.maximum(np.sqrt(np.pi / EXTERIOR.neighbors) * reach, self.cell / np.sqrt(3))
+        where, widest = self._cells(points), np.zeros((resolution,) * 3)
+        np.maximum.at(widest, tuple(where.T), spacing)
+        apart, closest = _distances(widest > 0)
+        apart *= self.cell / widest[closest]
+        label: Any = ndimage.label(apart > EXTERIOR.gate)
+        label = np.asarray(label[0])
+        beside, closest = _distances(label > 0)
+        grown = (apart > EXTERIOR.wall) & (beside * self.cell <= (EXTERIOR.gate - EXTERIOR.wall) * widest.max())
+        label = np.where(grown, label[closest], label)
+        size = np.bincount(label.ravel())
+        size[[0, label[0, 0, 0]]] = 0
+        kept = [int(label[0, 0, 0]), *np.argsort(-size)[: int((size >= EXTERIOR.fewest).sum())].tolist()]
+        names = np.zeros(len(size), np.int64)
+        names[kept] = OUTER_REGION + np.arange(len(kept))
+        self.count = len(kept)
+        self._region = names[label]
+
+    def regions(self, x: Float64) -> Int64:
+        """The region of each of ``(M, 3)`` places: 0 near the cloud's points, `OUTER_REGION`, or more if enclosed."""
+        return self._region[tuple(self._cells(x).T)]
+
+    def _cells(self, x: Float64) -> Int64:
+        return np.floor((x + EXTERIOR.half) / self.cell).astype(np.int64).clip(0, EXTERIOR.resolution - 1)
 
 
-def nearest(points: Float64, count: int) -> Index:
-    """Indices ``(N, count)`` of each point's nearest points, itself first."""
-    _, index = KDTree(points).query(points, k=min(count, len(points)), workers=-1)
-    return np.asarray(index, np.int64)
+def _distances(there: NDArray[np.bool_]) -> tuple[Float64, tuple[Int64, ...]]:
+    """For each cell the distance, in cells, to the nearest that is ``there``, and the indices of that."""
+    found: Any = ndimage.distance_transform_edt(~there, return_indices=True)
+    return found[0], tuple(found[1])

@@ -1,16 +1,11 @@
 """Outliers and flipped normals of a cloud, found from each point's neighbours before anything is fitted.
 
-A point is judged by two things. How isolated is it: the distance to its eighth neighbour against those of its
-neighbours (as in Breunig et al., "LOF: identifying density-based local outliers", SIGMOD 2000) and against the
-cloud's median. And whom does it agree with: a neighbour supports it if it lies near the neighbour's plane and their
-normals mirror each other in the middle of the edge between them, as on any arc of a circle (the rule of König and
-Gumhold, see :mod:`.orientation`): so the two sides of a thin blade support each other. Sparseness alone condemns
-nothing, nor does an odd normal: thin and sharp parts have many.
+The distance to the eighth neighbour is compared as in Breunig et al., "LOF" (SIGMOD 2000).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,13 +15,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from ..point_cloud import centred
-from .orientation import fit_planes
+from ..point_cloud import Float64, Int64, centred
+from .orientation import blocks, fit_planes, query
 
-__all__ = ["Verdict", "agreement", "inspect_points", "unsupported"]
-
-Float64 = NDArray[np.float64]
-Rows = NDArray[np.integer]
 Mask = NDArray[np.bool_]
 
 
@@ -35,36 +26,27 @@ class OutlierOptions:
     """Which points belong to no surface."""
 
     neighbors: int = 12
-    reach: int = 8  # the neighbour whose distance tells how sparse a place is
+    reach: int = 8  # the neighbour whose distance, the reach, measures how sparse a place is
     block: int = 1 << 16  # points handled at once, to bound memory
-    # Distance of that neighbour over its neighbours' (1 in 1,000 of clean points), and over the median (1 in 30,000).
-    sparser: float = 2.5
-    sparse: float = 4.0
-    # Of a neighbour that supports a point: sine of the edge's elevation over its plane (0.58 at the corners of a cube),
-    # and cosine of the mirrored normals; the same of points so many times sparser than others.
-    elevation: float = 0.6
-    mirrored: float = 0.5
-    lonely: float = 4.0
+    rounds: int = 4  # most rounds, as dropped points may have been each other's neighbours
+    sparser: float = 2.5  # reach over that of the neighbours; 1 in 1,000 of clean points
+    sparse: float = 4.0  # reach over the median; 1 in 30,000
+    elevation: float = 0.6  # sine of the edge over a supporting neighbour's plane; 0.58 at the corners of a cube
+    mirrored: float = 0.5  # cosine of the mirrored normals of a supporting neighbour
+    lonely: float = 4.0  # times sparser, from which on the next two hold
     lonely_elevation: float = 0.3
     lonely_mirrored: float = 0.9
-    flat: float = 0.25  # deviation from a plane, over that distance, up to which planes are trusted
-    # Share of the peers that must support a point as strictly, and how far they may be in units of its reach.
-    company: float = 0.16
-    beside: float = 2.0
-    majority: float = 0.5  # share of neighbours that must support a sparse point
+    flat: float = 0.25  # deviation from a plane, in reaches, up to which planes are used
+    company: float = 0.16  # least fraction of peers that support a point
+    beside: float = 2.0  # largest distance of those peers, in reaches
+    majority: float = 0.5  # least fraction of neighbours that support a sparse point
 
 
 OUTLIERS = OutlierOptions()
 
 
 class Verdict(NamedTuple):
-    """What `inspect_points` finds; each ``(N,)``.
-
-    Attributes:
-        isolated: points far from all others.
-        outliers: other points that belong to no surface.
-        flipped: kept points whose normal is to be turned round.
-    """
+    """Masks ``(N,)``: points far from all others, other outliers, kept points whose normal is to be reversed."""
 
     isolated: Mask
     outliers: Mask
@@ -79,23 +61,13 @@ def inspect_points(
     outliers: bool = True,
     flips: bool = True,
 ) -> Verdict:
-    """Find strays and flipped normals.
+    """Find isolated points, outliers and flipped normals of ``(N, 3)`` finite points.
 
-    Isolated is a point whose eighth neighbour is ``isolation`` times further away than the median point's, unless it
-    has company: neighbours about as sparse that support it. Outliers are points that are sparse (`sparser`, `sparse`)
-    and supported by fewer than half of their neighbours; points off the plane, or across the normals, that all their
-    neighbours agree on; and small clusters apart whose members do not support each other. As strays may be each
-    other's neighbours, those of the dropped are judged again. A normal is flipped if nearly all neighbours in the
-    point's own plane, which those on the far side of a thin part are not, have the opposite one, and are themselves
-    trusted by theirs: two sheets in one place, with opposite normals, have no such points.
-
-    Args:
-        points: ``(N, 3)``, finite.
-        normals: ``(N, 3)`` unit normals, or None: planes through the neighbourhoods then stand in for them,
-            neighbourhoods that are not flat support nothing, and nothing is flipped.
-        isolation: the factor; None finds no isolated points.
-        outliers: whether to look for the other outliers.
-        flips: whether to look for flipped normals.
+    Isolated: the eighth neighbour is ``isolation`` times further away than the median point's, and too few neighbours
+    that are as sparse support the point. Outliers: sparse points with little support, points off the plane or across
+    the normals that their neighbours agree on, and small clusters without mutual support. Flipped: nearly all
+    neighbours in the point's plane have the opposite normal, and are supported themselves. Without ``normals``, planes
+    through the neighbourhoods replace them, and nothing is flipped.
     """
     count = len(points)
     isolated, stray, flipped = np.zeros((3, count), bool)
@@ -114,44 +86,36 @@ def inspect_points(
     return Verdict(isolated, stray, flipped & cloud.kept)
 
 
-def unsupported(points: Float64, normals: Float64, rows: Rows) -> Mask:
-    """Which of the points ``rows`` ``(m,)`` of a cloud ``(N, 3)`` neither most neighbours nor their peers support."""
+def unsupported(points: Float64, normals: Float64, rows: Int64) -> Mask:
+    """Which points ``rows`` ``(m,)`` of a cloud ``(N, 3)`` neither most neighbours nor their peers support."""
     if len(points) <= 2 * OUTLIERS.neighbors or not len(rows):
         return np.zeros(len(rows), bool)
     cloud = _Cloud(points, normals)
-    support = _by_blocks(rows, lambda part: _support(cloud, part, np.zeros(len(part), bool)))
+    support = _by_blocks(rows, lambda part: _support(cloud, part))
     return (support < OUTLIERS.majority) & ~_has_company(cloud, rows)
 
 
-def agreement(points: Float64, normals: Float64, rows: Rows) -> tuple[Float64, Float64]:
-    """What the neighbours of the points ``rows`` ``(m,)`` of a cloud ``(N, 3)`` say of them.
+def agreement(points: Float64, normals: Float64, rows: Int64) -> tuple[Float64, Float64]:
+    """The fraction of neighbours that support the points ``rows`` ``(m,)``, and their mean normals ``(m, 3)``.
 
-    Returns:
-        The share of their neighbours that support them ``(m,)``, and their neighbours' mean normals ``(m, 3)``, of
-        length 1 where all agree. In a cloud too small for neighbourhoods every point agrees.
+    1 and the points' own normals in a cloud too small for neighbourhoods.
     """
     if len(points) <= 2 * OUTLIERS.neighbors:
         return np.ones(len(rows)), normals[rows]
     cloud = _Cloud(points, normals, rows)
-    support = _by_blocks(rows, lambda part: _support(cloud, part, np.zeros(len(part), bool)))
-    means = [normals[cloud.near[part]].mean(axis=1) for part in _blocks(rows)]
+    support = _by_blocks(rows, lambda part: _support(cloud, part))
+    means = [normals[cloud.near[part]].mean(axis=1) for part in blocks(rows, OUTLIERS.block)]
     return support, np.concatenate([np.empty((0, 3)), *means])
 
 
 class _Cloud:
-    """Points and their neighbours, those that are dropped left out.
+    """Points around the origin, normals, and neighbours ``near`` ``(N, k)`` among the points that are ``kept``.
 
-    Attributes:
-        points: ``(N, 3)``, around the origin: a tree over map coordinates would lose digits.
-        normals: ``(N, 3)``, given or of planes.
-        signed: whether the normals' signs mean anything.
-        flat: ``(N,)`` whether a neighbourhood may support anything.
-        near: ``(N, k)`` indices of the nearest points, without the point itself.
-        reach: ``(N,)`` distance to the eighth of them.
-        kept: ``(N,)``.
+    ``signed``: normals were given, not fitted. ``flat`` ``(N,)``: the neighbourhood may support points. ``reach``
+    ``(N,)``: distance to the eighth neighbour.
     """
 
-    def __init__(self, points: Float64, normals: Float64 | None, rows: Rows | None = None) -> None:
+    def __init__(self, points: Float64, normals: Float64 | None, rows: Int64 | None = None) -> None:
         self.points = centred(points)
         self.signed = normals is not None
         self.normals = np.zeros_like(points) if normals is None else normals
@@ -161,8 +125,8 @@ class _Cloud:
         self.kept = np.ones(len(points), bool)
         self._look(np.arange(len(points)) if rows is None else rows)
 
-    def drop(self, dropped: Mask) -> Rows:
-        """Leave points out → the kept points that lost neighbours, which have new ones now."""
+    def drop(self, dropped: Mask) -> Int64:
+        """Leave points out; returns the kept points that have new neighbours therefore."""
         self.kept &= ~dropped
         if self.kept.sum() <= self.near.shape[1]:
             return np.empty(0, np.int64)
@@ -172,24 +136,24 @@ class _Cloud:
             self._look(changed)
         return changed
 
-    def _look(self, rows: Rows) -> None:
+    def _look(self, rows: Int64) -> None:
         among = np.flatnonzero(self.kept).astype(np.int32)
         tree = KDTree(self.points[among], compact_nodes=False, balanced_tree=False)
-        for part in _blocks(rows):
-            distance, found = tree.query(self.points[part], k=self.near.shape[1] + 1, workers=-1)
-            self.near[part] = among[np.asarray(found)[:, 1:]]
-            self.reach[part] = np.asarray(distance)[:, min(OUTLIERS.reach, self.near.shape[1])]
+        for part in blocks(rows, OUTLIERS.block):
+            distance, found = query(tree, self.points[part], self.near.shape[1] + 1)
+            self.near[part] = among[found[:, 1:]]
+            self.reach[part] = distance[:, min(OUTLIERS.reach, self.near.shape[1])]
             if not self.signed:
                 self.normals[part], spread = fit_planes(self.points[self.near[part]])
                 self.flat[part] = spread < OUTLIERS.flat * self.reach[part]
 
-    def edges(self, rows: Rows, near: Rows | None = None) -> tuple[Float64, Float64]:
-        """Vectors to the neighbours or ``near`` ``(m, k, 3)``, and their lengths ``(m, k)``, which are never zero."""
+    def edges(self, rows: Int64, near: NDArray[np.integer] | None = None) -> tuple[Float64, Float64]:
+        """Vectors to the neighbours, or ``near``, ``(m, k, 3)``, and their lengths ``(m, k)``, which are never zero."""
         edge = self.points[self.near[rows] if near is None else near] - self.points[rows][:, None]
         return edge, np.maximum(np.linalg.norm(edge, axis=2), 1e-300)
 
-    def thinning(self, rows: Rows) -> Float64:
-        """How many times sparser it is around points ``(m,)`` than around their neighbours."""
+    def thinning(self, rows: Int64) -> Float64:
+        """Reach of points ``(m,)`` over the median of their neighbours."""
         return self.reach[rows] / np.maximum(np.median(self.reach[self.near[rows, : OUTLIERS.reach]], axis=1), 1e-300)
 
 
@@ -201,13 +165,13 @@ def _isolated(cloud: _Cloud, factor: float) -> Mask:
     return isolated
 
 
-def _outliers(cloud: _Cloud, *, rounds: int = 4) -> Mask:
+def _outliers(cloud: _Cloud) -> Mask:
     before, usual = cloud.kept.copy(), float(np.median(cloud.reach[cloud.kept]))
     support = np.ones(len(before))
-    asked = np.flatnonzero(before)
-    for _ in range(rounds):
+    rows = np.flatnonzero(before)
+    for _ in range(OUTLIERS.rounds):
         dropped = np.zeros(len(before), bool)
-        for part in _blocks(asked):
+        for part in blocks(rows, OUTLIERS.block):
             thinning, overall = cloud.thinning(part), cloud.reach[part] / usual
             sparse = (thinning > OUTLIERS.sparser) | (overall > OUTLIERS.sparse)
             lonely = (thinning > OUTLIERS.lonely) | (overall > OUTLIERS.lonely * OUTLIERS.sparse)
@@ -216,19 +180,18 @@ def _outliers(cloud: _Cloud, *, rounds: int = 4) -> Mask:
         suspects = np.flatnonzero(dropped)
         dropped[suspects] = ~_has_company(cloud, suspects)
         if cloud.kept.sum() - dropped.sum() <= 2 * OUTLIERS.neighbors:
-            break  # nothing here is sound enough to judge the rest by
-        asked = cloud.drop(dropped)
-        if len(asked) == 0:
+            break  # too few points are left to compare the rest with
+        rows = cloud.drop(dropped)
+        if len(rows) == 0:
             break
     cloud.drop(_stray_clusters(cloud, support))
     return before & ~cloud.kept
 
 
-def _has_company(cloud: _Cloud, rows: Rows) -> Mask:
-    """Whether points ``(m,)`` have peers that support them: the nearest points where the cloud is about as sparse.
+def _has_company(cloud: _Cloud, rows: Int64) -> Mask:
+    """Whether enough peers support points ``(m,)``: the nearest among those of at least half of their reach.
 
-    A point at the border of a sparse part has the points of a dense edge for neighbours, whose normals turn within its
-    own spacing. The reach of peers is at least half of its own, in steps of a factor of two.
+    At the border of a sparse part, the nearest of all points lie on a dense edge, whose normals turn within a spacing.
     """
     support, count = np.zeros(len(rows)), cloud.near.shape[1]
     octave = np.floor(np.log2(np.maximum(cloud.reach[rows], 1e-300))).astype(np.int64)
@@ -236,8 +199,8 @@ def _has_company(cloud: _Cloud, rows: Rows) -> Mask:
         mine, peers = np.flatnonzero(octave == step), np.flatnonzero(cloud.kept & (cloud.reach >= 2.0**step))
         if len(peers) <= count:
             continue
-        distance, found = KDTree(cloud.points[peers]).query(cloud.points[rows[mine]], k=count + 1, workers=-1)
-        distance, near = np.asarray(distance), peers[np.asarray(found)[:, 1:]]
+        distance, found = query(KDTree(cloud.points[peers]), cloud.points[rows[mine]], count + 1)
+        near = peers[found[:, 1:]]
         if not cloud.signed:
             cloud.normals[rows[mine]], spread = fit_planes(cloud.points[near])
             cloud.flat[rows[mine]] = spread < OUTLIERS.flat * distance[:, OUTLIERS.reach]
@@ -247,34 +210,29 @@ def _has_company(cloud: _Cloud, rows: Rows) -> Mask:
     return support >= OUTLIERS.company * (1 if cloud.signed else 2)
 
 
-def _flipped(cloud: _Cloud, normals: Float64, *, rounds: int = 4) -> Mask:
+def _flipped(cloud: _Cloud, normals: Float64) -> Mask:
     flipped = np.zeros(len(normals), bool)
-    everyone = np.flatnonzero(cloud.kept)
-    nobody = np.ones(len(normals), bool)
-    for _ in range(rounds):
+    rows, everyone = np.flatnonzero(cloud.kept), np.ones(len(normals), bool)
+    for _ in range(OUTLIERS.rounds):
         turned = np.where(flipped[:, None], -normals, normals)
         share = np.full(len(normals), 0.5)
-        share[everyone] = _by_blocks(everyone, lambda part: _vote(cloud, turned, part, nobody)[0])  # noqa: B023
+        share[rows] = _by_blocks(rows, lambda part: _vote(cloud, turned, part, everyone)[0])  # noqa: B023
         doubtful = np.flatnonzero(share <= 0.3)
-        votes = [_vote(cloud, turned, part, share >= 0.7) for part in _blocks(doubtful)]
-        wrong = [
-            part[(alike <= 0.2) & (voters >= 3) & (voters >= 0.4 * asked)]
-            for part, (alike, voters, asked) in zip(_blocks(doubtful), votes, strict=True)
-        ]
-        found = np.concatenate([np.empty(0, np.int64), *wrong])
+        wrong = [np.empty(0, np.int64)]
+        for part in blocks(doubtful, OUTLIERS.block):
+            alike, voters, level = _vote(cloud, turned, part, share >= 0.7)
+            wrong.append(part[(alike <= 0.2) & (voters >= 3) & (voters >= 0.4 * level)])
+        found = np.concatenate(wrong)
         if len(found) == 0:
             break
         flipped[found] ^= True
     return flipped
 
 
-def _vote(
-    cloud: _Cloud, normals: Float64, rows: Rows, trusted: Mask
-) -> tuple[Float64, NDArray[np.int64], NDArray[np.int64]]:
-    """Of the neighbours in a point's plane: the share of the trusted that have a normal like its own, 0.5 for none.
+def _vote(cloud: _Cloud, normals: Float64, rows: Int64, trusted: Mask) -> tuple[Float64, Int64, Int64]:
+    """Votes of the neighbours in the planes of points ``(m,)``, each ``(m,)``.
 
-    Returns:
-        The share, how many are trusted, and how many there are, each ``(m,)``.
+    The fraction of the trusted ones with a like normal (0.5 of none), the number of trusted ones, and of all.
     """
     near = cloud.near[rows]
     edge, length = cloud.edges(rows)
@@ -289,12 +247,20 @@ def _vote(
     return np.where(voters > 0, alike, 0.5), voters, level.sum(axis=1)
 
 
-def _support(cloud: _Cloud, rows: Rows, lonely: Mask, near: Rows | None = None, beside: Mask | None = None) -> Float64:
-    """The share of the neighbours, or ``near``, that support points ``(m,)``; of ``lonely`` ones more is asked.
+def _support(
+    cloud: _Cloud,
+    rows: Int64,
+    lonely: Mask | None = None,
+    near: NDArray[np.integer] | None = None,
+    beside: Mask | None = None,
+) -> Float64:
+    """The fraction of neighbours, or ``near`` ``(m, k)``, that support points ``(m,)``; stricter where ``lonely``.
 
-    Only those of ``near`` ``(m, k)`` that are ``beside`` a point ``(m, k)`` can support it.
+    A neighbour supports a point near its plane whose normal mirrors its own across the middle of the edge, as on any
+    arc of a circle. ``beside`` ``(m, k)`` masks those that may.
     """
     near = cloud.near[rows] if near is None else near
+    lonely = np.zeros(len(rows), bool) if lonely is None else lonely
     edge, length = cloud.edges(rows, near)
     own, theirs = cloud.normals[rows], cloud.normals[near]
     rise = np.einsum("mkd,mkd->mk", edge, theirs) / length
@@ -308,7 +274,7 @@ def _support(cloud: _Cloud, rows: Rows, lonely: Mask, near: Rows | None = None, 
     return supports.mean(axis=1) * cloud.flat[rows]
 
 
-def _off(cloud: _Cloud, rows: Rows) -> Mask:
+def _off(cloud: _Cloud, rows: Int64) -> Mask:
     """Whether three in four neighbours agree on a plane and a normal, and the point ``(m,)`` is off them."""
     edge, _ = cloud.edges(rows)
     theirs, reach = cloud.normals[cloud.near[rows]], cloud.reach[rows]
@@ -349,10 +315,5 @@ def _stray_clusters(cloud: _Cloud, support: Float64) -> Mask:
     return (small & (mean < OUTLIERS.majority))[group] & cloud.kept
 
 
-def _blocks(rows: Rows) -> Iterator[Rows]:
-    for start in range(0, len(rows), OUTLIERS.block):
-        yield rows[start : start + OUTLIERS.block]
-
-
-def _by_blocks(rows: Rows, function: Callable[[Rows], Float64]) -> Float64:
-    return np.concatenate([np.empty(0), *(function(part) for part in _blocks(rows))])
+def _by_blocks(rows: Int64, function: Callable[[Int64], Float64]) -> Float64:
+    return np.concatenate([np.empty(0), *(function(part) for part in blocks(rows, OUTLIERS.block))])

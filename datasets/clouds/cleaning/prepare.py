@@ -10,21 +10,15 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ....neural_fields import InputError, Similarity
-from ..point_cloud import PointCloud, centred, middle_of, unit_rows, usable_rows, weld
+from ..point_cloud import Float64, Int64, PointCloud, centred, middle_of, unit_rows, usable_rows, weld
 from ..readers.reading import MIN_POINTS
-from .judging import layer_level, neighborly, worse_normals
-from .noise import noise_deviation, noise_level, smooth_along_normals
-from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
+from .noise import denoise, noise_deviation, noise_level, replace_bad_normals, smooth_along_normals
+from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness, query
 from .outliers import agreement, inspect_points
-from .reestimate import denoise, refit_normals
 from .winding import orient_by_winding
 
-__all__ = ["CleaningReport", "OrientedCloud", "prepare_cloud"]
-
-Float64 = NDArray[np.float64]
-
-# Least share of neighbours that support a point (see `agreement`) once noise is smoothed off points whose normals were
-# estimated: fewer support those that were moved along another layer's normal, and to the wrong place.
+# Least fraction of neighbours that support a point after smoothing along estimated normals (see `agreement`): fewer
+# support a point that was moved along the normal of another layer.
 SUPPORTED = 0.3
 
 
@@ -41,16 +35,15 @@ class CleaningReport:
         dropped_outliers: other points that belong to no surface.
         repaired_normals: zero or NaN normals replaced by their neighbours' mean.
         dropped_normals: points whose normal could not be repaired.
-        turned_normals: normals turned round because their neighbours' point the other way.
+        turned_normals: normals reversed because those of their neighbours are opposite.
         normals_source: "file", "mesh" (from the file's faces) or "estimated".
-        flipped: whether all normals pointed inward and were turned round.
+        flipped: whether all normals pointed inward and were reversed.
         pieces: connected pieces of the cloud; 0 if normals were not estimated, or a sensor oriented them.
-        oriented_by: what gave estimated normals their signs: "winding" numbers, "propagation" from point to point in
-            each piece, the "sensor", or the first "level" of a fit; None for those of a file.
-        smoothed_noise: thickness, in input units, of the layer that the points were moved together from, along the
-            normals (see `noise_level`); 0 if they were left where they are.
-        noise_deviation: standard deviation, in input units, of that noise (see `noise_deviation`).
-        reestimated_normals: normals of the file that were worse than planes through the points, and were replaced.
+        smoothed_noise: thickness of the noise that was smoothed off, in input units (see `noise_level`); 0 for none.
+        oriented_by: source of the signs of estimated normals: "winding" numbers, "propagation" from point to point in
+            each piece, the "sensor", or the first "level" of a fit; None for normals of a file.
+        noise_deviation: standard deviation of that noise, in input units.
+        reestimated_normals: normals of the file that fitted the points less well than planes, and were replaced.
     """
 
     read: int
@@ -137,7 +130,7 @@ class OrientedCloud:
 
     @property
     def estimated(self) -> bool:
-        """Whether normals, all or some, were estimated from the points: at sharp edges each is one side's by chance."""
+        """Whether normals, all or some, were estimated from the points: at sharp edges the side is then arbitrary."""
         return self.report.normals_source == "estimated" or self.report.reestimated_normals > 0
 
 
@@ -160,25 +153,23 @@ def prepare_cloud(
     Args:
         cloud: as read.
         normals: "file" keeps the file's normals and their sign; "estimate" ignores them; "auto" takes the
-            file's if at least half are usable, and turns them all round when they plainly point inward.
-        sensor_origin: where the scanner stood, in input coordinates; estimated normals are turned towards it.
+            file's if at least half are usable, and reverses them all if they clearly point inward.
+        sensor_origin: position of the scanner, in input coordinates; estimated normals are turned towards it.
         neighbors: size of the neighbourhoods normals are estimated and repaired from; doubled for estimation,
-            at most twice, while the cloud is too noisy for them to look flat.
-        isolation: points whose eighth neighbour is this many times further away than the median point's are dropped:
-            a single stray point of a scan would get a bubble of surface to itself, and set the scale. Those that
-            neighbours about as sparse support (see `inspect_points`) stay: they are a sparser part. None keeps all.
-        drop_outliers: whether other points that belong to no surface are dropped (see `inspect_points`); and after
-            noise was smoothed along estimated normals, those that few of their neighbours support (`SUPPORTED`).
-        turn_normals: whether single normals of the file that point the other way than their neighbours' are turned
-            round; with ``normals="file"`` none is.
-        smooth_noise: whether points are moved along their normals to where their neighbours agree, if the noise is
-            wide enough for that to be told (see :mod:`.noise`); estimated normals are then fitted once more to the
-            moved points (see :mod:`.reestimate`). With ``normals="auto"`` those of a file are judged by the points
-            first, and replaced, with their sign, where they are worse than what the points say (see :mod:`.judging`).
+            at most twice, while noise makes them look thick.
+        isolation: points whose eighth neighbour is this many times further away than the median point's are dropped,
+            except sparser parts (see `inspect_points`). None keeps all.
+        drop_outliers: whether to drop other points that belong to no surface (see `inspect_points`), and after
+            smoothing along estimated normals those that few of their neighbours support.
+        turn_normals: whether to reverse single normals of the file that are opposite to their neighbours'; not with
+            ``normals="file"``.
+        smooth_noise: whether to smooth noise off along the normals, if it is wider than the spacing (see
+            :mod:`.noise`). Estimated normals are then fitted again, and with ``normals="auto"`` those of a file that
+            fit the points less well than planes are replaced first.
 
     Raises:
         InputError: too few points are left, or ``normals="file"`` and there are none.
-        ValueError: ``normals`` or ``neighbors`` is none of those allowed.
+        ValueError: ``normals``, ``neighbors`` or ``isolation`` is out of range.
     """
     if normals not in ("auto", "file", "estimate"):
         raise ValueError(f"normals={normals!r}: expected 'auto', 'file' or 'estimate'")
@@ -208,16 +199,11 @@ def prepare_cloud(
     dropped_normals = len(distinct) - len(kept)
     places, noise, deviation, reestimated = cloud.points[kept], 0.0, 0.0, 0
     if unit is not None and normals == "auto" and smooth_noise and cloud.normals_source == "file":
-        unit, reestimated = _agreeing(places, unit)
-    if unit is not None and smooth_noise:  # before the rest: noise mixes up the sides of thin parts
+        unit, reestimated = replace_bad_normals(places, unit)
+    if unit is not None and smooth_noise:  # before outliers are found: noise mixes up the sides of thin parts
         places, noise, deviation = _smoothed(places, unit, flips=turn_normals and normals == "auto")
-    found = inspect_points(
-        places,
-        unit,
-        isolation=isolation,
-        outliers=drop_outliers,
-        flips=turn_normals and normals == "auto",
-    )
+    flips = turn_normals and normals == "auto"
+    found = inspect_points(places, unit, isolation=isolation, outliers=drop_outliers, flips=flips)
     sound = ~(found.isolated | found.outliers)
     kept = kept[sound]
     _check_enough(len(kept), cloud, "are left after dropping outliers; keep them with --no-drop-outliers")
@@ -272,29 +258,10 @@ def _check_enough(count: int, cloud: PointCloud, why: str) -> None:
         )
 
 
-def _agreeing(points: Float64, normals: Float64) -> tuple[Float64, int]:
-    """Normals of a file, those that are worse than planes through the points replaced, and how many were.
-
-    Where the points are noisy as well, planes are fitted in turns with smoothing, as for normals that are estimated,
-    and replace all.
-    """
-    around = centred(points)
-    level = layer_level(around, normals)
-    worse = worse_normals(around, normals, level)
-    if not worse.any():
-        return normals, 0
-    guides = neighborly(around, normals)
-    if level:
-        return denoise(around, guides)[1], len(normals)
-    fitted = refit_normals(around, guides, 0.0, neighbors=16)
-    return np.where(worse[:, None], fitted, normals), int(worse.sum())
-
-
 def _smoothed(points: Float64, normals: Float64, *, flips: bool = False) -> tuple[Float64, float, float]:
-    """Points without the noise along their normals, how thick their layer was, and its standard deviation.
+    """Points smoothed along their normals, the thickness of their layer, and the standard deviation of the noise.
 
-    Where ``flips`` may be among the normals of a thin part, one side passes for noise about the other: what is no noise
-    once they are turned round is none.
+    With ``flips``, single normals of a thin part may be reversed, and its far side then looks like noise.
     """
     middle = middle_of(points)
     level, sound = noise_level(points - middle, normals), normals
@@ -311,19 +278,16 @@ def _smoothed(points: Float64, normals: Float64, *, flips: bool = False) -> tupl
 def _repair(
     points: Float64, normals: Float64, usable: NDArray[np.bool_], neighbors: int, *, agreement: float = 0.5
 ) -> tuple[Float64, NDArray[np.bool_]]:
-    """Replace unusable normals by the mean of the nearest usable ones.
+    """Normals ``(N, 3)``, unusable ones replaced by the mean of the nearest usable ones, and a mask of the usable.
 
-    A mean shorter than ``agreement`` (1: all equal, 0: they cancel) decides nothing.
-
-    Returns:
-        Normals ``(N, 3)``, and which of them are decided ``(N,)``.
+    A normal stays unusable where that mean is shorter than ``agreement`` (1: all equal, 0: they cancel).
     """
     missing = np.flatnonzero(~usable)
     if len(missing) == 0:
         return normals, usable
     shifted = centred(points)
-    near = KDTree(shifted[usable]).query(shifted[missing], k=min(neighbors, int(usable.sum())), workers=-1)[1]
-    mean = normals[usable][near.reshape(len(missing), -1)].mean(axis=1)
+    near = query(KDTree(shifted[usable]), shifted[missing], neighbors)[1]
+    mean = normals[usable][near].mean(axis=1)
     length = np.linalg.norm(mean, axis=1)
     clear = length > agreement
     repaired, decided = normals.copy(), usable.copy()
@@ -335,11 +299,7 @@ def _repair(
 def _plainly_inward(
     points: Float64, normals: Float64, *, score: float = -0.3, share: float = 0.9, opening: float = 0.15
 ) -> bool:
-    """Whether the evidence is overwhelming: an open scan, seen from one side, must not be turned round.
-
-    A hollow seen from its open side has inward normals, rightly; it is told from a closed body turned inside out
-    by the sum of its area-weighted normals, which over a closed surface is zero (see :func:`openness`).
-    """
+    """Whether normals clearly point inward, and not because the cloud is an open scan of a hollow (see `openness`)."""
     mean, negative = outwardness(points, normals)
     return mean < score and negative >= share and openness(points, normals) < opening
 
@@ -347,6 +307,7 @@ def _plainly_inward(
 def _estimate(
     points: Float64, neighbors: int, similarity: Similarity, sensor_origin: tuple[float, float, float] | None
 ) -> tuple[Float64, int, Literal["winding", "propagation", "sensor"]]:
+    """Oriented normals, the number of pieces (0: not counted), and what oriented them."""
     near, normals, spread = _planes(points, neighbors)
     if sensor_origin is not None:
         towards = similarity.to_unit(np.asarray(sensor_origin, np.float64)) - points
@@ -360,7 +321,7 @@ def _estimate(
 
 def _planes(
     points: Float64, neighbors: int, *, flat: float = 0.25, doublings: int = 2
-) -> tuple[NDArray[np.int64], Float64, Float64]:
+) -> tuple[Int64, Float64, Float64]:
     """Neighbourhoods with a median thickness below ``flat`` times their radius, and the planes through them."""
     near = nearest(points, neighbors)
     normals, spread = estimate_normals(points, near)

@@ -13,12 +13,18 @@ from mplicits.datasets import (
     sample_torus,
 )
 from mplicits.datasets.clouds.cleaning.outliers import agreement, inspect_points
+from mplicits.datasets.clouds.point_cloud import unit_rows
 from mplicits.neural_fields import Box, Torus
 
 
-def inspected(cloud: PointCloud, **settings):
+def normals_of(cloud: PointCloud) -> np.ndarray:
+    """``(N, 3)`` float64."""
     assert cloud.normals is not None
-    return inspect_points(cloud.points, cloud.normals.astype(np.float64), **settings)
+    return cloud.normals.astype(np.float64)
+
+
+def inspected(cloud: PointCloud, **settings):
+    return inspect_points(cloud.points, normals_of(cloud), **settings)
 
 
 def thin_box(count: int = 8000, *, thickness: float = 0.02) -> PointCloud:
@@ -33,9 +39,8 @@ def ball_on_sparse_ground() -> PointCloud:
     ground = np.c_[x.ravel(), y.ravel()] + random.uniform(-0.015, 0.015, (x.size, 2))
     ground = np.c_[ground, np.zeros(len(ground))][np.linalg.norm(ground, axis=1) > 0.4]
     ball = sample_sphere(12_000, radius=0.4)
-    assert ball.normals is not None
     upper = ball.points[:, 2] > 0
-    normals = np.concatenate([np.tile([0, 0, 1], (len(ground), 1)), ball.normals[upper]]).astype(np.float32)
+    normals = np.concatenate([np.tile([0, 0, 1], (len(ground), 1)), normals_of(ball)[upper]]).astype(np.float32)
     return PointCloud(np.concatenate([ground, ball.points[upper]]), normals, source="ground")
 
 
@@ -64,9 +69,7 @@ def test_strays_are_found_but_for_those_that_touch_the_surface(fraction, given):
     """Where the spacing of the points is 0.02, those further away than three times that."""
     clean = sample_sphere(8000)
     cloud = add_outliers(clean, fraction, seed=3)
-    assert cloud.normals is not None
-    normals = cloud.normals.astype(np.float64) if given else None
-    found = inspect_points(cloud.points, normals)
+    found = inspect_points(cloud.points, normals_of(cloud) if given else None)
     assert not found.outliers[:8000].any()
     away = np.abs(np.linalg.norm(cloud.points[8000:], axis=1) - 0.5)
     assert found.outliers[8000:][away > 0.06].mean() > (0.96 if given else 0.9)
@@ -95,11 +98,8 @@ def test_small_clusters_apart_are_dropped_unless_they_hold_together():
     clump = random.normal(size=(15, 3)) * 0.004 + [0.9, 0, 0]
     spray = random.normal(size=(15, 3))
     ball = sample_sphere(15, radius=0.01, seed=5)
-    assert sphere.normals is not None
-    assert ball.normals is not None
     points = np.concatenate((sphere.points, clump, ball.points - [0.9, 0, 0]))
-    normals = np.concatenate((sphere.normals, spray / np.linalg.norm(spray, axis=1, keepdims=True), ball.normals))
-    found = inspect_points(points, normals.astype(np.float64)).outliers
+    found = inspect_points(points, np.concatenate((normals_of(sphere), unit_rows(spray), normals_of(ball)))).outliers
     assert not found[:20_000].any()
     assert found[20_000:20_015].sum() >= 13
     assert not found[20_015:].any()
@@ -109,9 +109,8 @@ def test_small_clusters_apart_are_dropped_unless_they_hold_together():
 @pytest.mark.parametrize("shape", ["sphere", "torus", "thin box"])
 def test_flipped_normals_are_found(shape, fraction):
     cloud = CLEAN[shape]()
-    assert cloud.normals is not None
     flipped = np.random.default_rng(1).random(len(cloud)) < fraction
-    found = inspect_points(cloud.points, np.where(flipped[:, None], -cloud.normals, cloud.normals).astype(np.float64))
+    found = inspect_points(cloud.points, normals_of(cloud) * np.where(flipped, -1, 1)[:, None])
     assert found.outliers.mean() < 0.002
     assert found.flipped[flipped].mean() > (0.9 if fraction <= 0.1 else 0.7)
     assert (found.flipped & ~flipped).sum() <= 2
@@ -131,10 +130,8 @@ def test_two_sheets_in_one_place_are_left_alone():
 def test_a_sparser_part_is_not_isolated_but_a_stray_is():
     """Fifty times as sparse as the rest, on its own: with company, it stays."""
     dense, sparse = sample_sphere(60_000, radius=0.1), sample_sphere(600, radius=0.5)
-    assert dense.normals is not None
-    assert sparse.normals is not None
     points = np.concatenate((dense.points, sparse.points + np.array([2.0, 0, 0]), [[0.0, 6.0, 0.0]]))
-    normals = np.concatenate((dense.normals, sparse.normals, [[0.0, 0.6, 0.8]])).astype(np.float64)
+    normals = np.concatenate((normals_of(dense), normals_of(sparse), [[0.0, 0.6, 0.8]]))
     found = inspect_points(points, normals, isolation=30.0)
     assert np.flatnonzero(found.isolated).tolist() == [60_600]
     assert not found.outliers.any()
@@ -142,8 +139,7 @@ def test_a_sparser_part_is_not_isolated_but_a_stray_is():
 
 def test_agreement_of_few_points():
     cloud = sample_torus(4000)
-    assert cloud.normals is not None
-    normals = cloud.normals.astype(np.float64)
+    normals = normals_of(cloud)
     normals[7] *= -1
     support, means = agreement(cloud.points, normals, np.array([7, 100]))
     assert support[0] < 0.1 < 0.9 < support[1]
@@ -156,8 +152,7 @@ def test_prepared_clouds_count_what_was_done():
     torus = Torus(major=0.5, minor=0.2)
     clean = sample_torus(8000)
     cloud = add_outliers(clean, 0.02, seed=1)
-    assert cloud.normals is not None
-    normals = cloud.normals.copy()
+    normals = normals_of(cloud).astype(np.float32)
     normals[:800] *= -1
     prepared = prepare_cloud(PointCloud(cloud.points, normals), drop_outliers=True, turn_normals=True)
     report = prepared.report
@@ -175,7 +170,9 @@ def test_prepared_clouds_count_what_was_done():
 
 @pytest.mark.parametrize("count", [4, 10, 30])
 def test_tiny_clouds(count):
+    """Fewer points than neighbours."""
     cloud = sample_sphere(count)
+    assert count < 10 or len(prepare_cloud(PointCloud(cloud.points))) == count
     found = inspected(cloud, isolation=30.0)
     assert not found.outliers.any()
     assert len(found.flipped) == count
