@@ -5,8 +5,8 @@ import torch
 from mplicits.datasets import sample_sphere
 from mplicits.neural_fields import Field, Sphere, Union
 from mplicits.neural_fields.fields.primitives import Evaluated
-from mplicits.pipelines.fit.band import BAND, Band, band_of, delta_of, with_wrong_sides
 from mplicits.pipelines.fit.cloud import CloudDistance
+from mplicits.pipelines.fit.samples import BAND, Band, band_of, delta_of, with_wrong_sides
 
 
 def test_delta_is_equation_5() -> None:

@@ -14,8 +14,7 @@ from mplicits.datasets import PointCloud
 from mplicits.neural_fields import InputError, load_field
 from mplicits.neural_fields.meshing.extract import extract_mesh
 from mplicits.pipelines.cli.fit import describe
-from mplicits.pipelines.fit.heldout import JUDGE
-from mplicits.pipelines.fit.level import LEVEL, calm_omega
+from mplicits.pipelines.fit.level import JUDGE, LEVEL, calm_omega
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.folder import read_record
 from mplicits.pipelines.training.machine import choose_device

@@ -10,20 +10,19 @@ from mplicits.datasets import PointCloud
 from mplicits.datasets.synthetic.samples import sample_sphere
 from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.fit import describe
-from mplicits.pipelines.fit.band import Band
-from mplicits.pipelines.fit.heldout import (
+from mplicits.pipelines.fit.level import (
     JUDGE,
     Each,
     Error,
     Fall,
     Judge,
+    LevelObjective,
     Verdict,
     held_out,
     standard_errors,
     voxels_of,
 )
-from mplicits.pipelines.fit.level import LevelObjective
-from mplicits.pipelines.fit.samples import Samples, Source, Usual, with_previous
+from mplicits.pipelines.fit.samples import Band, Samples, Source, Usual, with_previous
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Trainer
