@@ -287,7 +287,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
                 "sampling_seconds": round(sampling_seconds, 3),
                 "training_seconds": round(trainer.elapsed, 3),
                 "steps": trainer.step,
-                "ended_by_time_budget": trainer.ended_early,
+                "ended_by_time_budget": trainer.ended_early and not objective.hopeless,
                 "silenced": silenced,
                 "held_out": None if verdict is None else verdict.record(level, scale=self.similarity.scale),
                 "losses": trainer.losses,

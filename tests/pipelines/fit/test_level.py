@@ -24,7 +24,7 @@ from mplicits.pipelines.fit.level import (
 from mplicits.pipelines.fit.samples import Samples, Source, Usual, with_previous
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.settings import FitConfig
-from mplicits.pipelines.training.trainer import Trainer
+from mplicits.pipelines.training.trainer import Group, Trainer
 
 CPU = torch.device("cpu")
 RADIUS, OFF = 0.5, 0.02
@@ -131,6 +131,22 @@ def test_the_best_weights_are_kept_and_checkpoints_keep_them() -> None:
     assert 0 < verdict.at < 1
     assert level.judge.errors(level.siren).mean() == verdict.after  # type: ignore[union-attr]
     assert other.take_best() == verdict
+
+
+def test_training_ends_where_held_out_points_say_that_everything_gets_worse() -> None:
+    wrong = objective(judge_of(RADIUS - OFF), 0.0)
+    torch.manual_seed(0)
+    wrong.siren.load_state_dict(Siren(8, 2, omega=10.0).state_dict())  # far from the truth, in distance and in angle
+    wrong.groups = [Group(list(wrong.siren.parameters()), lambda _: 0.0)]
+    trainer = Trainer(wrong, stage="level 1", steps=80)
+    assert trainer.run()
+    assert trainer.step == 30 + 1  # judged at every eighth of the schedule, from three on
+    verdict = wrong.take_best()
+    assert not verdict.better
+    resumed = Trainer(objective(judge_of(RADIUS - OFF), 0.0), stage="level 1", steps=80)
+    resumed.restore(trainer.state())
+    assert resumed.run()
+    assert resumed.step == trainer.step
 
 
 def test_what_chance_may_have_done_is_not_sure() -> None:
