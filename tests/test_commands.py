@@ -32,7 +32,7 @@ from mplicits.pipelines.cli import main
 from mplicits.pipelines.mesh import finish
 from mplicits.pipelines.mesh.extract import MeshOptions
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.render import subject
+from mplicits.pipelines.render import draw
 from mplicits.pipelines.texture import transport
 from mplicits.pipelines.training.settings import TextureConfig
 from mplicits.pipelines.web import export
@@ -242,7 +242,7 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(scene_mesh.__kwdefaults__, "resolution", 48)
     # A motion of thirty steps starts anywhere.
     monkeypatch.setattr(transport, "TRANSPORT", dataclasses.replace(transport.TRANSPORT, astray=1.0))
-    for module in (subject, export):
+    for module in (draw, export):
         monkeypatch.setattr(module, "FRAME_RESOLUTION", 24)
     texture = TextureConfig(width=16, depth=1, steps=5, batch=64, band_batch=64, samples=500)
     monkeypatch.setattr(finish, "TextureConfig", lambda: texture)

@@ -121,9 +121,9 @@ def extract_mesh(
 def map_normals(mesh: Mesh, field: FieldLike, *, level: int = -1, batch: int = 1 << 18) -> Mesh:
     """Neural normal mapping (paper, Sec. 3): the mesh with normals ∇f_j(p) / |∇f_j(p)| at its vertices p.
 
-    For an f_j that is a distance this is the normal of its surface at the point nearest to p: a coarse mesh, in the
-    field's coordinates, shades like a fine one as long as it stays within the bands of the level. ``batch`` is points
-    per call.
+    Where f_j is a distance, this is the normal of its surface at the point nearest to p. So a coarse mesh, in the
+    coordinates of the field, shades like a fine one as long as it stays within the bands of the level. ``batch`` is
+    points per call.
     """
     field = as_field(field)
     points = torch.from_numpy(mesh.vertices).to(field.like)

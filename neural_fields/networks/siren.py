@@ -366,8 +366,8 @@ class _SirenJet(torch.autograd.Function):
     """Outputs and gradient of a SIREN, with the derivative of both written out.
 
     Let ō and ḡ be the cotangents of outputs and gradient. The reverse sweep is linear in ḡ, so its adjoint is one
-    forward sweep of a single tangent, u_0 = ḡ, u_i = (u_{i-1} W_iᵀ) ⊙ cos z_i; the value's adjoint is the usual
-    backward pass, which picks up −(u_{i-1} W_iᵀ) ⊙ g_i ⊙ sin z_i on the way. Both halves of a weight's gradient, s_iᵀ
+    forward sweep of a single tangent: u_0 = ḡ, u_i = (u_{i-1} W_iᵀ) ⊙ cos z_i. The value's adjoint is the usual
+    backward pass, with −(u_{i-1} W_iᵀ) ⊙ g_i ⊙ sin z_i added on the way. Both halves of a weight's gradient, s_iᵀ
     u_{i-1} and z̄_iᵀ h_{i-1}, are accumulated in one buffer.
     """
 

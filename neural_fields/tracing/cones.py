@@ -38,10 +38,10 @@ def cone_starts(
 ) -> Tensor:
     """Depths ``(H, W)`` up to which whole tiles of an image are empty, infinite where nothing can be visible.
 
-    They are ``near`` of `sphere_trace` at ``level``, from one cone for each tile, marched on level 0. A cone of spread
-    σ (the largest distance between the directions of a tile and its middle one) holds the tile's rays at depth t within
-    tσ of its axis, so with v = |f_0| on the axis the tile is empty up to t + ((v − δ_0)/L − tσ) / (1 + σ). Tiles are
-    marched from large to small, each starting where the larger one ended, and keep a ``clearance`` from the surface.
+    They are ``near`` of `sphere_trace` at ``level``, from one cone for each tile, marched on level 0. The spread σ of a
+    cone is the largest distance between the directions of a tile and its middle one. At depth t the tile's rays lie
+    within tσ of the axis, so with v = |f_0| on the axis the tile is empty up to t + ((v − δ_0)/L − tσ) / (1 + σ). Tiles
+    are marched from large to small, each starting where the larger one ended, and keep a ``clearance`` to the surface.
 
     ``origin`` is ``(3,)``, ``directions`` ``(H, W, 3)`` of any length but 0; ``tiles`` are sides in pixels, each a
     multiple of the next. ValueError for other shapes, or a field that is not three-dimensional.

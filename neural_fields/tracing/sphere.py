@@ -1,8 +1,8 @@
 """Sphere tracing of any field, with coarse levels leading fine ones (paper Sec. 3 and suppl. "Rendering").
 
-Let v = |f(p)| at a point of a ray. The ball around p that holds no zero of f has the radius r = (v − δ_j) / L, with δ_j
-the half-width of the first band that v is not inside of (0 inside all of them) and L the Lipschitz constant: outside
-band j the value is that of level j, and the surface lies where |f_j| < δ_j. One rule serves all levels.
+Let v = |f(p)| at a point of a ray. A ball around p of radius r = (v − δ_j) / L holds no zero of f. Here δ_j is the
+half-width of the first band that v is not inside of (0 inside all of them), and L the Lipschitz constant. Outside band
+j the value is that of level j, and the surface lies where |f_j| < δ_j: one rule serves all levels.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Volume rendering of a signed distance field, as in NeuS (Wang et al. 2021): pure functions of rays and samples.
 
-A ray x(t) = o + t v is cut into intervals. With Φ_s(f) = 1 / (1 + e^{−s f}), an interval along which f falls from f_in
-to f_out stops the share α = max(0, 1 − Φ_s(f_out) / Φ_s(f_in)) = 1 − e^{−τ} of the light, with the optical depth τ =
-softplus(−s f_out) − softplus(−s f_in). Transmittances are T_i = exp(−Σ_{j<i} τ_j), the weights w_i = T_i α_i, so Σ w_i
-+ T_end = 1 without products that underflow.
+A ray x(t) = o + t v is cut into intervals. Let Φ_s(f) = 1 / (1 + e^{−s f}). An interval along which f falls from f_in
+to f_out stops the share α = max(0, 1 − Φ_s(f_out) / Φ_s(f_in)) = 1 − e^{−τ} of the light. Its optical depth is
+τ = softplus(−s f_out) − softplus(−s f_in). Transmittances are T_i = exp(−Σ_{j<i} τ_j), the weights w_i = T_i α_i, so
+Σ w_i + T_end = 1 without products that underflow.
 """
 
 from __future__ import annotations

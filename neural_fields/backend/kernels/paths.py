@@ -2,7 +2,7 @@
 
 Each program has SLOTS places for rays, a ring of free ones, and for each level a ring of those that wait for its value.
 Free places take the next rays of a queue that all programs share. A program serves its longest ring, up to ROWS rays at
-a time: a value in the next band sends its ray to the ring of the next level; any other goes through `look_at`, after
+a time. A value in the next band sends its ray to the ring of the next level. Any other goes through `look_at`, after
 which the ray has ended or goes back to level 0. So tiles of every level stay full. The state of rays lies in a scratch
 of the program's own. The rules are those of `sphere_trace` without expectations; see `tracing.py`.
 """
