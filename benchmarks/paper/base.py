@@ -15,11 +15,18 @@ import numpy as np
 import torch
 from mplicits.datasets import OrientedCloud
 from mplicits.neural_fields import Field, MultiscaleSDF, Similarity, Siren, load_field
-from mplicits.pipelines.fit.band import band_of
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.level import LevelObjective, new_level
-from mplicits.pipelines.fit.samples import Source, Weights, distance_samples, surface_samples, with_previous
-from mplicits.pipelines.fit.train import prepare, review_points
+from mplicits.pipelines.fit.review import review_points
+from mplicits.pipelines.fit.samples import (
+    Source,
+    Weights,
+    band_of,
+    distance_samples,
+    surface_samples,
+    with_previous,
+)
+from mplicits.pipelines.fit.train import prepare
 from mplicits.pipelines.training.folder import find_field
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Report, Trainer

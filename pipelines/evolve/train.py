@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import InputError, MultiscaleSDF, SpaceTimeSDF
-from ..fit.band import delta_of
 from ..fit.level import new_level
+from ..fit.samples import delta_of
 from ..training.folder import VELOCITY_FILE, RunFolder, digest_of, load_motion
 from ..training.progress import Progress, Report, reported, silent
 from ..training.result import Run

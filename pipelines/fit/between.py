@@ -1,17 +1,4 @@
-"""Points between the points of a cloud: what holds a level down where nothing was measured.
-
-A network may do what it likes between its samples, and a residual one does: a smooth cloud comes out dimpled like an
-orange. A cloud with normals says more than its points do. A point p_i and the normals of its neighbours make a patch,
-
-    f_i(x) = ⟨n_i, d⟩ + ½ dᵀ S_i d,  d = x − p_i,
-
-whose shape operator S_i fits n_j − n_i ≈ S_i (p_j − p_i) best, over the neighbours on an arc of circle with it:
-½(n_i + n_j)·(p_j − p_i) ≈ 0 whatever the curvature. New points lie where the patches around them, blended as in moving
-least squares surfaces (Kolluri, "Provably good moving least squares", SODA 2005), are zero. Only patches whose normals
-agree are blended, as in robust ones (Öztireli, Guennebaud and Gross, "Feature preserving point set surfaces based on
-non-linear kernel regression", 2009), and a place beyond an edge is left empty: edges stay sharp. So is one where
-patches contradict each other: the wider the noise, the fewer points there are.
-"""
+"""Points between those of a sparse cloud, which keep a residual level from oscillating there."""
 
 from __future__ import annotations
 
@@ -27,8 +14,6 @@ from torch import Tensor
 
 from .cloud import CLOUD, CloudDistance
 
-__all__ = ["BetweenOptions", "Densified", "dense_distance", "densified"]
-
 Float64 = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -38,66 +23,41 @@ Mask = NDArray[np.bool_]
 class BetweenOptions:
     """Numbers of `densified`; lengths in the units that each comment says."""
 
-    neighbors: int = 16  # that a patch is fitted to
-    blended: int = 8  # patches that a place is asked of
+    neighbors: int = 16  # of which a patch is fitted
+    blended: int = 8  # patches at a place
     block: int = 1 << 15  # rows handled at once, to bound memory
-    # Cosine between the normals of a point and of a neighbour on the same smooth surface, and how far from an arc of
-    # circle they may be: |½(n_i + n_j)·(p_j − p_i)| over the distance, 0.35 for a corner's mean normal and a side's.
-    alike: float = 0.85
-    mirrored: float = 0.08
-    # Between the normals of patches at one place, which their curvature has turned towards each other.
-    agreed: float = 0.9
-    # Of a patch's neighbours: how many must agree with it, the second over the first eigenvalue of their spread, and
-    # the sum of weights that must be across it. The points along an edge have each other's mean normals: a line is no
-    # patch.
-    company: int = 4
-    wide: float = 0.1
-    enough: float = 0.2
-    ridge: float = 0.02  # of that fit, in the same units
-    # Height of a point over the plane of a patch, over its distance, below which it is in its rim whatever its
-    # normal: on a smooth surface normals that are not alike are at heights above a quarter. Such a patch must have so
-    # many neighbours of its own in the row, and as many in the rim as another has company.
-    rim: float = 0.03
-    row: int = 2
-    # All in units of the distance to the fourth nearest point: how much patches may differ at a new point, how far
-    # one may be beyond another's plane, and how near two must pass to a point of an edge.
-    spread: float = 0.05
-    beyond: float = 0.03
-    through: float = 0.1
-    # In those units, how far a new point may be from the weighted mean of the points around it. On the rim of a
-    # half-plane that is 1/√π = 0.56, and beyond it more.
-    one_sided: float = 0.7
-    # Least part of the sphere of directions that a solid, or the space around it, fills at a new point: half of it on
-    # a smooth surface, a fourth on the edge of a cube, and next to nothing where guessed normals have led beyond an
-    # edge.
-    solid_angle: float = 0.2
-    # That is asked only where so many of the cloud's own points meet it: an open sheet sees nothing of itself.
-    closed: float = 0.95
-    asked: int = 4000
-    # Radians that the finest level's frequency may turn through between two points. Where four points lie on a wave
-    # they hold it down, and nothing is filled in: patches are less exact than the points themselves. Where it turns
-    # through k times as much, `filling` (k² − 1) places are tried for each point.
+    alike: float = 0.85  # cosine between normals of neighbours on one smooth surface
+    mirrored: float = 0.08  # |½(n_i + n_j)·(p_j − p_i)| over the distance on an arc; 0.35 at a corner's mean normal
+    agreed: float = 0.9  # cosine between normals of patches at one place
+    company: int = 4  # least number of neighbours that agree with a patch
+    wide: float = 0.1  # second over first eigenvalue of their spread: the points along an edge make no patch
+    enough: float = 0.2  # least sum of weights across a patch
+    ridge: float = 0.02  # ridge term of the fit, in the same units
+    rim: float = 0.03  # height over the plane of a patch, over the distance, below which a point is in its rim
+    row: int = 2  # least number of agreeing neighbours of a narrow face, which has `company` in its rim
+    # Lengths in units of the distance to the fourth nearest point.
+    spread: float = 0.05  # largest spread of patch values at a new point
+    beyond: float = 0.03  # largest height over the plane of a disagreeing patch
+    through: float = 0.1  # largest distance of two patches from a point of an edge
+    one_sided: float = 0.7  # distance to the weighted mean of the points around; 1/√π = 0.56 on a half-plane's rim
+    solid_angle: float = 0.2  # least part of the directions on either side: ½ on smooth surfaces, ¼ on a cube's edge
+    closed: float = 0.95  # share of the cloud's points that meet `solid_angle`, below which it is an open sheet
+    tested: int = 4000  # points of the cloud tested for that
+    # Phase of the finest level between two points in radians, below which four points fix a wave and none is added.
     turn: float = np.pi / 2
-    filling: float = 16.0
+    filling: float = 16.0  # places tried for each point, times k² − 1 at a phase of k `turn`
 
 
 BETWEEN = BetweenOptions()
 
 
 class Densified(NamedTuple):
-    """What a cloud says of its surface.
+    """A densified cloud."""
 
-    Attributes:
-        normals: ``(N, 3)`` of the cloud; those on an edge, which no side has, are one side's.
-        repaired: how many of them.
-        points: ``(M, 3)`` new points.
-        new_normals: ``(M, 3)`` theirs.
-    """
-
-    normals: Float64
-    repaired: int
-    points: Float64
-    new_normals: Float64
+    normals: Float64  # (N, 3) of the cloud; those on an edge are replaced by one side's
+    repaired: int  # how many of them
+    points: Float64  # (M, 3) new points
+    new_normals: Float64  # (M, 3)
 
 
 def dense_distance(
@@ -111,17 +71,10 @@ def dense_distance(
     seed: int = 0,
     options: BetweenOptions = BETWEEN,
 ) -> CloudDistance:
-    """Distances to a cloud, and where it is sparse for a network of frequency ``omega``, to what fills it in.
+    """Distances to a cloud, densified where it is sparse for a network of frequency ``omega``.
 
-    Args:
-        points: ``(N, 3)`` points in the unit sphere.
-        normals: ``(N, 3)`` outward unit normals.
-        omega: the highest frequency that will be fitted to it.
-        count: points of the cloud and places tried between them, all together.
-        noise: see `CloudDistance`.
-        guessed: see `CloudDistance`.
-        seed: of the places.
-        options: numbers of the algorithm.
+    ``count`` limits the points of the cloud and the places tried between them together. See `CloudDistance` for
+    ``noise`` and ``guessed``.
     """
     about = {"noise": noise, "guessed": guessed}
     index = CloudDistance(points, normals, **about)
@@ -132,7 +85,7 @@ def dense_distance(
     noisy = guessed and noise > 0
     found = densified(index.points, index.normals, new, share=wanted, guessed=noisy, seed=seed, options=options)
     new_points, new_normals = (torch.from_numpy(a.astype(np.float32)) for a in (found.points, found.new_normals))
-    if noisy and _on_solid(index, index.points[:: 1 + len(points) // options.asked], options).mean() > options.closed:
+    if noisy and _on_solid(index, index.points[:: 1 + len(points) // options.tested], options).mean() > options.closed:
         kept = torch.from_numpy(_on_solid(index, new_points.numpy(), options))
         new_points, new_normals = new_points[kept], new_normals[kept]
     own_normals = torch.from_numpy(found.normals.astype(np.float32))
@@ -141,7 +94,7 @@ def dense_distance(
 
 
 def _on_solid(index: CloudDistance, x: NDArray[np.float32], options: BetweenOptions) -> Mask:
-    """Whether both sides of each of ``(M, 3)`` points of a surface have `solid_angle`, by winding numbers."""
+    """Whether both sides of each of ``(M, 3)`` surface points have `solid_angle`, by winding numbers."""
     return np.abs(index.winding_number(x, soft=CLOUD.soft_guessed) - 0.5) < 0.5 - options.solid_angle
 
 
@@ -155,17 +108,16 @@ def densified(
     seed: int = 0,
     options: BetweenOptions = BETWEEN,
 ) -> Densified:
-    """Find points of the surface between those of a cloud.
+    """Find points of the surface between those of a cloud, by patches fitted to points and normals.
 
-    Args:
-        points: ``(N, 3)``, around the origin.
-        normals: ``(N, 3)`` unit normals.
-        count: how many places are tried; most of them become points where the cloud is sound.
-        share: ``(N,)`` in proportion to which they are tried beside each point; None for the area of each.
-        guessed: whether the normals were estimated from noisy points: those beyond an edge may then not contradict
-            what runs on beyond it, and new points must have points on all sides.
-        seed: of the places.
-        options: numbers of the algorithm.
+    A point p_i has the patch f_i(x) = ⟨n_i, d⟩ + ½ dᵀ S_i d with d = x − p_i. Its shape operator S_i is the
+    least-squares fit of n_j − n_i ≈ S_i (p_j − p_i) over neighbours on an arc of circle with it, ½(n_i + n_j)·(p_j −
+    p_i) ≈ 0. New points are zeros of the patches around them, blended as in moving least squares surfaces (Kolluri,
+    SODA 2005). Only patches with agreeing normals are blended (Öztireli, Guennebaud and Gross, 2009), and places beyond
+    an edge or with contradicting patches stay empty: edges stay sharp.
+
+    ``count`` places are tried, in proportion to ``share`` ``(N,)`` beside each point (None: by area). With ``guessed``
+    normals, estimated from noise, new points must have points on all sides.
     """
     if len(points) <= options.neighbors:  # too few for a neighbourhood that is not the whole
         return Densified(normals.astype(np.float64), 0, np.empty((0, 3)), np.empty((0, 3)))
@@ -177,7 +129,7 @@ def densified(
     if len(able):
         random = np.random.default_rng(seed)
         chance = share[able].astype(np.float64)
-        # In order: neighbours are near in memory.
+        # Sorted, so that neighbours are near in memory.
         parents = np.sort(random.choice(able, count, p=chance / chance.sum()))
         for start in range(0, count, options.block):
             found.append(_placed(patches, parents[start : start + options.block], random, guessed=guessed))
@@ -186,14 +138,9 @@ def densified(
 
 
 class _Patches:
-    """The patch of every point.
+    """The patch of every point: its shape operator ``(N, 3, 3)``, reach, and soundness.
 
-    Attributes:
-        points: ``(N, 3)``.
-        normals: ``(N, 3)``.
-        shape: ``(N, 3, 3)`` S_i.
-        reach: ``(N,)`` distance to the sixth neighbour.
-        sound: ``(N,)`` whether neighbours on all sides agree with it.
+    ``reach`` ``(N,)`` is the distance to the sixth neighbour; a patch is ``sound`` if neighbours on all sides agree.
     """
 
     def __init__(self, points: Float64, normals: Float64, options: BetweenOptions) -> None:
@@ -217,8 +164,8 @@ class _Patches:
         across = (edge - (edge * own).sum(axis=2, keepdims=True) * own) / scale[..., None]
         turn = theirs - (theirs * own).sum(axis=2, keepdims=True) * own
         spread, mixed, sound = _fitted(weight, near, across, turn, self.options)
-        # A face as narrow as two spacings has one row of points of its own. Those of its edges have the normals of
-        # other faces, but lie in its plane, where it is flat up to them.
+        # A face two spacings wide has one row of points of its own. The points of its edges have other normals, but
+        # lie in its plane.
         rim = ~weight & (np.abs((edge * own).sum(axis=2)) < self.options.rim * distance)
         turn = np.where(weight[..., None], turn, 0.0)
         wider, mixed_too, sound_too = _fitted(weight | rim, near, across, turn, self.options)
@@ -238,9 +185,8 @@ class _Patches:
     def at(self, x: Float64, count: int) -> tuple[Float64, Rows, Float64, Float64, Float64]:
         """The patches of the nearest points at ``(m, 3)`` places.
 
-        Returns:
-            Distances and rows of the points ``(m, k)``, vectors from them ``(m, k, 3)``, and the patches' values
-            ``(m, k)`` and unit normals ``(m, k, 3)``.
+        Distances and rows of the points ``(m, k)``, vectors from them ``(m, k, 3)``, values ``(m, k)`` and unit normals
+        ``(m, k, 3)`` of the patches.
         """
         distance, found = self._nearest(x, count)
         offset = x[:, None] - self.points[found]
@@ -253,14 +199,10 @@ class _Patches:
 def _fitted(
     chosen: Mask, near: Float64, across: Float64, turn: Float64, options: BetweenOptions
 ) -> tuple[Float64, Float64, Mask]:
-    """What the shape of patches is solved from, and which have company on all sides.
+    """The normal equations of the shapes, and which patches have ``chosen`` neighbours ``(n, k)`` on all sides.
 
-    Args:
-        chosen: ``(n, k)`` which neighbours are asked.
-        near: ``(n, k)`` weights by distance.
-        across: ``(n, k, 3)`` where they are in the plane.
-        turn: ``(n, k, 3)`` how their normals are turned.
-        options: numbers of the algorithm.
+    ``near`` ``(n, k)`` are weights; ``across`` and ``turn`` ``(n, k, 3)`` are positions in the plane and normal
+    changes.
     """
     weighted = ((chosen * near)[..., None] * across).transpose(0, 2, 1)  # (n, 3, k)
     spread = weighted @ across
@@ -274,7 +216,7 @@ def _fitted(
 def _repaired(patches: _Patches) -> tuple[Float64, int]:
     """The normals, those of points on an edge replaced by one side's, and how many were.
 
-    On an edge is a point through which sound patches of two sides pass, and that is part of no sound one itself.
+    Such a point has no sound patch, but sound patches of two sides pass through it.
     """
     options, fixed, odd = patches.options, patches.normals.copy(), np.flatnonzero(~patches.sound)
     if not len(odd):
@@ -306,7 +248,7 @@ def _placed(patches: _Patches, parents: Rows, random: np.random.Generator, *, gu
 
 
 def _blended(patches: _Patches, x: Float64, normal: Float64, one_sided: float) -> tuple[Float64, Float64, Mask]:
-    """What moves places ``(m, 3)`` onto the blend of patches with their normals; normals there; which are good."""
+    """Moves of places ``(m, 3)`` onto the blend of patches, its normals, and which places are good."""
     options = patches.options
     distance, found, offset, value, theirs = patches.at(x, options.blended)
     scale, sound = distance[:, 3:4], patches.sound[found]
@@ -321,7 +263,7 @@ def _blended(patches: _Patches, x: Float64, normal: Float64, one_sided: float) -
     mean = (weight * value).sum(axis=1, keepdims=True)
     blend = _unit((weight[..., None] * theirs).sum(axis=1))
     spread = np.sqrt((weight * (value - mean) ** 2).sum(axis=1, keepdims=True))
-    # Two points of a surface are both behind or both before the plane of the other, on arcs as on edges.
+    # Two points of one surface are on the same side of each other's planes, on arcs and edges alike.
     above, below = -(offset * blend[:, None]).sum(axis=2), (offset * patches.normals[found]).sum(axis=2)
     beyond = sound & (cosine < options.agreed) & (above * below < 0)
     beyond &= np.minimum(np.abs(above), np.abs(below)) > options.beyond * scale

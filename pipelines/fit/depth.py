@@ -32,52 +32,36 @@ from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in, partial_of
 from ..training.folder import CLOUD_FILE, kept_cloud, read_record
 from ..training.machine import choose_device
+from ..training.result import Run
+from ..training.settings import FitConfig
 from ..training.trainer import Report
-from .train import FitConfig, Run, fit, fit_moved
-
-__all__ = ["DepthInput", "depth_cloud", "fit_depth", "trim_suggestion"]
+from .train import fit, fit_moved
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class DepthInput:
-    """Depth maps, and what is known about them.
+    """Depth maps with their camera, colours and poses."""
 
-    Attributes:
-        depth: one depth map, or a folder of them, taken in order of their names.
-        intrinsics: a JSON file, or four numbers fx, fy, cx, cy; () if there are none.
-        fov: full vertical angle of view in degrees, where nothing better is known.
-        color: a picture, or a folder of as many as there are depth maps.
-        poses: trajectory.log or transforms.json.
-        scale: numbers in the depth files per unit.
-        inverse: whether they hold inverse depths.
-        resize_color: whether pictures of another size are scaled.
-        settings: of the cleaning.
-    """
-
-    depth: Path
-    intrinsics: tuple[str, ...] = ()
-    fov: float | None = None
-    color: Path | None = None
-    poses: Path | None = None
-    scale: float | None = None
-    inverse: bool = False
-    resize_color: bool = False
-    settings: DepthSettings = field(default_factory=DepthSettings)
+    depth: Path  # one depth map, or a folder of them in order of their names
+    intrinsics: tuple[str, ...] = ()  # a JSON file, or fx, fy, cx, cy in pixels
+    fov: float | None = None  # full vertical angle of view in degrees, without intrinsics
+    color: Path | None = None  # a picture, or a folder of as many as there are depth maps
+    poses: Path | None = None  # trajectory.log or transforms.json
+    scale: float | None = None  # numbers in the depth files per unit
+    inverse: bool = False  # whether the files hold inverse depths
+    resize_color: bool = False  # whether pictures of another size are scaled
+    settings: DepthSettings = field(default_factory=DepthSettings)  # of the cleaning
 
 
 def depth_cloud(source: DepthInput) -> tuple[PointCloud, DepthReport]:
-    """Read, clean and join depth maps.
-
-    Raises:
-        InputError: a file cannot be read, or they do not fit together.
-    """
+    """Read, clean and join depth maps."""
     return fuse_frames(_Files(source), source.settings)
 
 
 class _Files:
-    """The frames of a `DepthInput`: which files belong together is found at once, each is read when its turn comes."""
+    """The frames of a `DepthInput`: files are matched at once, and each is read in its turn."""
 
     def __init__(self, source: DepthInput) -> None:
         self.source = source
@@ -122,33 +106,21 @@ def fit_depth(
     progress: Report | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Run:
-    """Fit depth maps: make their cloud, keep it as ``cloud.ply`` in the run's directory, and fit that.
+    """Fit depth maps: make their cloud, keep it as ``cloud.ply`` in the run's directory, and `fit` that.
 
-    Normals are those of the depth maps, which face the camera: none is turned round, not even in a room seen from
-    inside, unless the configuration asks for other normals.
-
-    Args:
-        source: the depth maps; not read again where a run is resumed.
-        config: settings; the defaults are those of the ``default`` preset.
-        out: run directory.
-        resume: continue the interrupted run in ``out``.
-        progress: called now and then with how far the training is.
-        say: called with a few lines about the cloud, before the training.
-
-    Raises:
-        InputError: the depth maps cannot be used, or there is nothing to resume.
-        Interrupted: see `fit`.
+    Normals are those of the depth maps, which face the camera, unless the configuration says otherwise. A resumed run
+    does not read the depth maps again. ``say`` is called with a few lines about the cloud before the training.
     """
     if resume:
         return fit(kept_cloud(out), config, out=out, resume=True, progress=progress)
     config = config or FitConfig()
-    choose_device(config.device)  # or it would fail after the directory has been made
+    choose_device(config.device)  # before the directory is made
     cloud, facts = depth_cloud(source)
     if say is not None:
         say(facts.summary())
     if config.normals == "auto":
         config = dataclasses.replace(config, normals="file")
-    made = partial_of(out / CLOUD_FILE)  # until the first checkpoint, when what was there makes way
+    made = partial_of(out / CLOUD_FILE)  # an older cloud stays until the first checkpoint
     try:
         write_cloud_ply(made, cloud)
         return fit_moved(made, config, out=out, name=CLOUD_FILE, progress=progress)
@@ -157,11 +129,10 @@ def fit_depth(
 
 
 def trim_suggestion(run: Path) -> float:
-    """A distance for ``mplicits mesh --trim-distance`` that cuts off what closes an open surface behind.
+    """A distance for ``mplicits mesh --trim-distance`` that cuts the closing of an open surface off.
 
-    Three times the distance to the nearest neighbour (of 95 % of the points), so that there are no holes between
-    points, and three times how far the surface passes by them, square to that: a fit with an error larger than the
-    spacing would otherwise be cut away as a whole.
+    The root of the sum of squares of three spacings, so that no holes appear between points, and of three times the
+    error of the surface, or an inexact fit would be cut away.
     """
     error = read_record(run)["stages"][-1]["rms_at_points"]
     return 3 * math.hypot(spacing_of(read_cloud(run / CLOUD_FILE).points), error)
@@ -179,7 +150,7 @@ def _files(path: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
 
 
 def _in_order_of(files: list[Path], items: list[T], names: list[str | None], trouble: str) -> list[T]:
-    """What belongs to each file: by the stem of its name where all fit, by the nearest time, or by order."""
+    """The item of each file: by the stem of its name where all match, by the nearest time, or by order."""
     named = {_stem(name): item for name, item in zip(names, items, strict=True) if name is not None}
     if all(file.stem in named for file in files):
         return [named[file.stem] for file in files]
@@ -195,7 +166,7 @@ def _in_order_of(files: list[Path], items: list[T], names: list[str | None], tro
 
 
 def _stem(name: str) -> str:
-    """Of a file's name; a time, which has digits after a point, has no extension."""
+    """The stem of a file name; a time, which has digits after a point, has no extension."""
     path = Path(name)
     return path.stem if path.suffix.lower() in {*DEPTH_SUFFIXES, *COLOR_SUFFIXES} else path.name
 
@@ -209,7 +180,7 @@ def _seconds(names: list[str]) -> np.ndarray | None:
 
 
 def _cameras(files: list[Path], posed: list[PosedFrame], source: DepthInput) -> list[DepthCamera]:
-    """The lens of each depth map; what the user says comes before what the poses' file says."""
+    """The lens of each depth map; the user's arguments take precedence over the file of poses."""
     if len(source.intrinsics) == 1:
         height, width = read_depth(files[0], inverse=source.inverse).shape
         return [read_intrinsics(source.intrinsics[0], size=(width, height))] * len(files)

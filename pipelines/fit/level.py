@@ -1,46 +1,41 @@
-"""One level of a fit: an untrained SIREN, and Eq. 4 on what it learns from."""
+"""One level of a fit: its untrained network, its loss (Eq. 4), and the held-out points that judge it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ...neural_fields import Siren
+from ...neural_fields import Field, Siren
 from ...neural_fields.backend.devices import upload
 from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
 from ..training.settings import EvolveConfig, FitConfig
 from ..training.trainer import Group, Objective, seeded, warm_cosine
 from .cloud import drawn
-from .heldout import JUDGE, Judge, Verdict
-from .samples import Source
-
-__all__ = ["LevelObjective", "LevelOptions", "calm_omega", "new_level"]
+from .samples import SQUARES, Samples, Source, Usual, with_previous
 
 
 @dataclass(frozen=True)
 class LevelOptions:
     """Numbers of `new_level` and `calm_omega`."""
 
-    # A residual starts at a tenth of the usual output scale, close to the level before it.
-    residual_gain: float = 0.1
-    # Of a sparse cloud: at a tenth of the usual its waves tilt the normals of the level before by degrees.
-    small_gain: float = 0.01
-    # Largest frequency of a residual, in units of 1 / the standard deviation of noise that was smoothed off along
-    # estimated normals: of waves shorter than 2π/0.4 of those, smoothing leaves nothing in the points but noise.
-    # Where a cloud is filled in between its points, that smooths them once more, and edges need the higher ones.
+    residual_gain: float = 0.1  # output scale of an untrained residual, which starts close to the level before
+    small_gain: float = 0.01  # the same with robust normals: 0.1 tilts the normals of sparse clouds by degrees
+    # Largest frequency of a residual times the standard deviation of smoothed noise: smoothing along estimated normals
+    # leaves only noise at wavelengths below 2π/0.4 of it.
     calm: float = 0.4
-    # A level whose error at the points is so many times that of the level before is set to zero: data contradict
-    # themselves where a part is thinner than their noise.
-    worse: float = 2.0
+    worse: float = 2.0  # error at the points over that of the level before, above which a level is set to zero
 
 
 LEVEL = LevelOptions()
 
-BEST = "best."  # before the names of the weights that did best
+BEST = "best."  # prefix of the best weights in checkpoints
 
 
 def new_level(
@@ -53,9 +48,9 @@ def new_level(
     omega: float | None = None,
     options: LevelOptions = LEVEL,
 ) -> Siren:
-    """The untrained SIREN of a level, whose weights follow from the seed; small by ``gain`` where it is a residual.
+    """The untrained SIREN of a level, seeded by the configuration.
 
-    Its frequency is the configuration's, or ``omega``.
+    ``gain`` scales the output of a residual; ``omega`` replaces the configured frequency.
     """
     width, depth, omega = config.widths[level], config.depths[level], omega or config.omegas[level]
     with seeded(config.seed * 1009 + level):
@@ -63,24 +58,243 @@ def new_level(
 
 
 def calm_omega(config: FitConfig, level: int, noise: float, options: LevelOptions = LEVEL) -> float:
-    """The frequency of a level of a cloud whose normals were estimated from points with ``noise``, 0 for none.
+    """The frequency of a level where normals were estimated from points with ``noise`` (0 for none).
 
-    That of the configuration, but no more than `calm` / noise, which is no less than that of level 0.
+    At most `calm` / noise, but at least that of level 0.
     """
     omega = config.omegas[level]
     return min(omega, max(config.omegas[0], options.calm / noise)) if noise else omega
 
 
-class LevelObjective(Objective):
-    """The terms of Eq. 4 for one SIREN on sources of samples.
+@dataclass(frozen=True)
+class JudgeOptions:
+    """Numbers of `held_out` and `Judge`."""
 
-    Args:
-        siren: the level being trained.
-        sources: what it learns from.
-        learning_rate: the peak rate.
-        generator: CPU generator that draws the batches.
-        judge: points that are not among the sources. Where they say for sure that the level was better on its way than
-            at its end, it goes back to that.
+    fewest: int = 200  # held-out points: their mean square is known to a tenth
+    wanted: int = 600  # held-out points of clouds of which they are at most `spared`
+    spared: float = 0.05
+    most: float = 0.1  # largest held-out share; a smaller cloud spares none
+    learnt: float = 0.8  # root mean square at training points over that without the level: less is a large gain
+    voxel: float = 2.0  # edge of a voxel in spacings: about four points, a gap that neighbours can still fill
+    surely: float = 2.0  # standard errors
+    # Part of the schedule from which on training ends where distances and angles are both surely more than without the
+    # level. Levels set to zero in the end had 2.8 to 14 standard errors there (three shapes), kept ones less (four).
+    hopeless: float = 0.375
+    looks: int = 8  # judgements of a level during its training
+
+
+JUDGE = JudgeOptions()
+
+
+def held_out(
+    points: NDArray[np.float32], spacing: float, share: float, *, seed: int = 0, options: JudgeOptions = JUDGE
+) -> NDArray[np.bool_]:
+    """Which points ``(N,)`` of a cloud are held out: about a ``share``, in whole voxels drawn at random.
+
+    Neighbouring points share what a network overfits, so a voxel is held out whole. A small cloud spares none.
+    """
+    count = max(
+        options.fewest, math.ceil(share * len(points)), min(options.wanted, math.floor(options.spared * len(points)))
+    )
+    if not share or count > options.most * len(points) or not spacing > 0:
+        return np.zeros(len(points), bool)
+    owner = voxels_of(points, spacing, options=options)
+    order = np.random.default_rng(seed).permutation(int(owner.max()) + 1)
+    total = np.cumsum(np.bincount(owner)[order])
+    drawn = np.zeros(len(order), bool)
+    drawn[order[: int(np.searchsorted(total, count)) + 1]] = True
+    return drawn[owner]
+
+
+def voxels_of(points: NDArray[np.float32], spacing: float, options: JudgeOptions = JUDGE) -> NDArray[np.int64]:
+    """The voxel ``(N,)`` of each point, numbered from 0; its edge is `voxel` times the ``spacing``."""
+    cells = np.floor(points.astype(np.float64) / (options.voxel * spacing)).astype(np.int64)
+    owner = np.unique(cells @ np.array([1 << 42, 1 << 21, 1]), return_inverse=True)[1]
+    return owner.reshape(-1).astype(np.int64)
+
+
+def standard_errors(falls: Tensor, voxels: Tensor, areas: Tensor | None = None) -> float:
+    """The mean of ``falls`` ``(n,)`` over the surface in units of its standard error; above 2 it is hardly chance.
+
+    Points of a voxel are correlated, so the standard error is that of the K voxels (cluster-robust, Liang and Zeger,
+    Biometrika 1986). With areas a_i, the mean m = Σ a_i f_i / Σ a_i and the sum e_v of a voxel's a_i (f_i − m), it is
+    ``√(K / (K − 1) Σ_v e_v²) / Σ a_i``. ``voxels`` ``(n,)`` are numbered from 0; ``areas`` ``(n,)`` are equal if None.
+    """
+    if not len(falls):
+        return 0.0
+    falls = falls.double().cpu()
+    areas = torch.ones_like(falls) if areas is None else areas.double().cpu()
+    mean = (areas * falls).sum() / areas.sum()
+    sums = torch.zeros(int(voxels.max()) + 1, dtype=torch.float64).index_add_(0, voxels.cpu(), areas * (falls - mean))
+    count = len(voxels.unique())
+    error = float((sums.square().sum() * count / max(count - 1, 1)).sqrt() / areas.sum())
+    if math.isnan(error):  # a level that has diverged
+        return -math.inf
+    return float(mean) / error if error > 0 else math.copysign(math.inf, mean) if mean else 0.0
+
+
+class Error(NamedTuple):
+    """Mean errors of a field at held-out points."""
+
+    loss: float  # of the level, without the eikonal term
+    distance: float  # |f| in the unit sphere
+    angle: float  # between gradient and normal, in degrees
+
+
+class Fall(NamedTuple):
+    """Decrease of the mean errors at held-out points, in standard errors; negative for an increase."""
+
+    distance: float
+    angle: float
+
+
+class Verdict(NamedTuple):
+    """The judgement of a level at held-out points."""
+
+    points: int  # in the band
+    before: Error  # without the level
+    after: Error  # with it
+    at: float  # fraction of the steps after which the weights were kept
+    fall: Fall
+    learnt: float = 1.0  # root mean square of |f| at the training points over that without the level
+    guessed: bool = False  # whether the normals were estimated
+
+    @property
+    def better(self) -> bool:
+        """Whether the level is kept: one error is surely less and the other not surely more, or the level `learns`.
+
+        An angle to estimated normals never counts against a level.
+        """
+        against = self.fall.distance if self.guessed else min(self.fall)
+        sure = max(self.fall) > JUDGE.surely and against > -JUDGE.surely
+        return sure or self.learns
+
+    @property
+    def learns(self) -> bool:
+        """Whether both errors are less, and that at the points the level was trained on is less by far."""
+        return min(self.fall) > 0 and self.learnt < JUDGE.learnt
+
+    def words(self, level: int, *, scale: float = 1.0) -> str:
+        """One line for people; ``scale`` takes distances to input units."""
+        if not self.better:
+            judged = "set to zero"
+        elif self.at == 1:
+            judged = "kept"
+        else:
+            judged = f"kept as it was after {self.at:.0%} of its steps"
+        (_, *before), (_, *after) = self.before, self.after
+        pairs = zip(before, after, self.fall, (scale, 1.0), strict=True)
+        distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}{{}} ({_sure(fall)})" for b, a, fall, unit in pairs)
+        errors = f"mean distance {distance.format('')}, mean angle of the normals {angle.format('°')}"
+        if self.learns and max(self.fall) <= JUDGE.surely:
+            errors += f"; at those that it has learnt from the root mean square is {self.learnt:.2f} of what it was"
+        return f"level {level} {judged}: without it → with it, at {self.points:,} points that it has not seen: {errors}"
+
+    def record(self, level: int, *, scale: float = 1.0) -> dict[str, Any]:
+        """For ``run.json``, with distances in input units and angles in degrees."""
+        return {
+            "points": self.points,
+            "before": self.before.loss,
+            "after": self.after.loss,
+            "at": self.at,
+            "distance": [error.distance * scale for error in (self.before, self.after)],
+            "angle": [error.angle for error in (self.before, self.after)],
+            "fall_in_standard_errors": self.fall._asdict(),
+            "learnt": self.learnt,
+            "verdict": self.words(level, scale=scale),
+        }
+
+
+def _sure(fall: float, options: JudgeOptions = JUDGE) -> str:
+    if abs(fall) <= options.surely:
+        return "no sure difference"
+    return "surely less" if fall > 0 else "surely more"
+
+
+class Each(NamedTuple):
+    """Errors at every held-out point, and the areas, ``(count,)`` each."""
+
+    loss: Tensor
+    distance: Tensor
+    angle: Tensor
+    areas: Tensor
+
+    def mean(self) -> Error:
+        """The means over the surface."""
+        return Error(*(float((self.areas * error).sum() / self.areas.sum()) for error in self[:3]))
+
+
+class Judge:
+    """The errors of a level at ``points`` ``(n, 3)`` that it is not trained on.
+
+    They are means over the surface, by ``areas`` ``(n,)``, of the points in the band of half-width ``delta`` around
+    ``previous``. The loss is Eq. 4 without its eikonal term: where a level overfits noise, it rises at held-out points.
+    A level is kept by distances and angles instead, as squares are mostly those of few points at sharp edges.
+    """
+
+    def __init__(
+        self,
+        points: Tensor,
+        normals: Tensor,
+        previous: Field,
+        delta: float,
+        *,
+        spacing: float,
+        areas: Tensor | None = None,
+        data: float,
+        normal: float,
+        usual: Usual = SQUARES,
+        guessed: bool = False,
+        options: JudgeOptions = JUDGE,
+    ) -> None:
+        self.options = options
+        areas = torch.ones(len(points)) if areas is None else areas
+        samples = Samples(points, distance=torch.zeros(len(points)), normal=normals, area=areas)
+        self.samples = with_previous(samples, previous, delta, device=previous.like.device)
+        self.data, self.normal, self.usual, self.count = data, normal, usual, len(self.samples)
+        self.guessed = guessed
+        self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing, options=self.options))
+        assert self.samples.value is not None
+        assert self.samples.gradient is not None
+        self.without = self._errors(self.samples.value, self.samples.gradient)
+        self.before = self.without.mean()
+
+    @torch.no_grad()
+    def errors(self, siren: Siren) -> Each:
+        """Errors with the residual ``siren`` added to the levels before; `without` are those without it."""
+        value, gradient = self.samples.value, self.samples.gradient
+        assert value is not None
+        assert gradient is not None
+        jet = siren.jet(self.samples.points)
+        return self._errors(value + jet.value, gradient + jet.gradient)
+
+    def surely_less(self, first: Each, second: Each) -> bool:
+        """Whether the mean of the first losses is less, by more than chance."""
+        return standard_errors(second.loss - first.loss, self.voxels, first.areas) > self.options.surely
+
+    def verdict(self, each: Each, at: float) -> Verdict:
+        """The verdict on a level with these errors, kept after the fraction ``at`` of its steps."""
+        pairs = zip(self.without[1:3], each[1:3], strict=True)
+        fall = Fall(*(standard_errors(before - after, self.voxels, each.areas) for before, after in pairs))
+        return Verdict(self.count, self.before, each.mean(), at, fall, guessed=self.guessed)
+
+    def _errors(self, value: Tensor, gradient: Tensor) -> Each:
+        distance, normal = self.samples.distance, self.samples.normal
+        assert distance is not None
+        assert normal is not None
+        assert self.samples.area is not None
+        data, turn = data_loss(value, distance), normal_loss(gradient, normal)
+        # From the chord: the cosine of a small angle rounds to 1.
+        chord = (torch.nn.functional.normalize(gradient, dim=1) - normal).norm(dim=1)
+        angle = torch.rad2deg(2 * (chord.clamp(max=2) / 2).asin())
+        loss = self.data * pseudo_huber(data, self.usual.data) + self.normal * pseudo_huber(turn, self.usual.normal)
+        return Each(loss, data.sqrt(), angle, self.samples.area)
+
+
+class LevelObjective(Objective):
+    """The terms of Eq. 4 for one SIREN on ``sources``.
+
+    With a ``judge`` the level returns to earlier weights that were surely better at held-out points, see `take_best`.
     """
 
     def __init__(
@@ -96,15 +310,10 @@ class LevelObjective(Objective):
         self.siren, self.sources, self.judge = siren, sources, judge
         areas = (source.samples.area for source in sources)
         self.shares = [None if area is None else area.cpu().double().cumsum(0) for area in areas]
-        if judge is not None:  # in the checkpoints too
+        if judge is not None:  # `kept` is part of the checkpoints
             best = {BEST + name: tensor.clone() for name, tensor in siren.state_dict().items()}
-            self.kept = {
-                "looks": torch.zeros(1),
-                "hopeless": torch.zeros(1),
-                "least": torch.full((1,), math.inf),
-                "at": torch.ones(1),
-                **best,
-            }
+            self.kept = {"looks": torch.zeros(1), "hopeless": torch.zeros(1), "least": torch.full((1,), math.inf)}
+            self.kept |= {"at": torch.ones(1), **best}
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`: the mean of every term of every source."""
@@ -133,7 +342,7 @@ class LevelObjective(Objective):
         return terms, total
 
     def look(self, done: float) -> None:
-        """Ask the judge, and keep the weights if they are the best so far."""
+        """Judge the level, and keep its weights if they are the best so far."""
         if self.judge is None:
             return
         self.kept["looks"].fill_(int(done * JUDGE.looks))
@@ -149,15 +358,14 @@ class LevelObjective(Objective):
 
     @property
     def hopeless(self) -> bool:
-        """See `Objective.hopeless`: whether held-out points say for sure that the level makes everything worse."""
+        """See `Objective.hopeless`: the level makes distances and angles at held-out points surely worse."""
         return self.judge is not None and bool(self.kept["hopeless"])
 
     def take_best(self) -> Verdict | None:
-        """Look once more, and go back to the best weights if they are surely better → what was found; None without.
+        """Return to the best weights if they are surely better → the verdict; None without a judge.
 
-        The rates have fallen to nothing at the end, and with them the waves that the batches left; a few hundred points
-        hardly see those. So the last weights stay, unless they are worse by more than chance, or no better than none:
-        neither is their loss less, nor would the level be kept for its distances and angles.
+        Otherwise the last weights stay: the decayed learning rate has removed the noise of the batches, which a few
+        hundred points hardly show. Last weights that are no better than none do not stay.
         """
         if self.judge is None:
             return None

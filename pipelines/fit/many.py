@@ -20,24 +20,14 @@ from ..training.settings import FitConfig, load_config
 from ..training.trainer import Progress, Report
 from .train import fit
 
-__all__ = ["FitJob", "FitOutcome", "fit_many", "format_fits", "plan_fits"]
-
-# In the directory of all runs: the settings of those that are yet to begin.
-SETTINGS_FILE = "fits.json"
+SETTINGS_FILE = "fits.json"  # in the directory of all runs: the settings of those yet to begin
 
 FitOutcome = Outcome["FitJob", dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class FitJob:
-    """One of the fits.
-
-    Attributes:
-        cloud: the file.
-        directory: its run.
-        config: settings; a run that is resumed has its own.
-        resume: whether to go on with what is there.
-    """
+    """One of the fits: a cloud and its run directory; a resumed run has its own settings."""
 
     cloud: Path
     directory: Path
@@ -48,18 +38,11 @@ class FitJob:
 def plan_fits(
     clouds: Sequence[str | Path], out: Path, config: FitConfig | None, *, resume: bool = False, force: bool = False
 ) -> list[FitJob]:
-    """Check all there is to check before any work, and give every cloud its run directory ``out/<stem>``.
+    """Check everything before any work, and give every cloud its run directory ``out/<stem>``.
 
-    Args:
-        clouds: the files.
-        out: directory of all runs.
-        config: settings of all; None with ``resume``, which finds them in ``out``.
-        resume: go on with what was interrupted, begin what was not begun, leave alone what is finished.
-        force: overwrite runs that are there.
-
-    Raises:
-        InputError: a cloud is missing or of an unknown kind, two have one name, a run is there already, or there is
-            nothing to resume.
+    ``resume`` continues interrupted runs, begins missing ones and skips finished ones, with the settings kept in
+    ``out``. An `InputError` names a missing or unknown file, two clouds of one name, an existing run, or nothing to
+    resume.
     """
     paths = [check_cloud_path(cloud) for cloud in clouds]
     twice = [stem for stem, count in Counter(path.stem for path in paths).items() if count > 1]
@@ -84,22 +67,9 @@ def fit_many(
     progress: Callable[[str, Progress], None] | None = None,
     report: Callable[[FitOutcome], None] | None = None,
 ) -> list[FitOutcome]:
-    """Fit them all; one that fails does not stop the rest.
+    """Fit all clouds, also after one has failed → the record of each run, or the reason of its failure.
 
-    Args:
-        planned: by `plan_fits`.
-        out: directory of all runs; keeps their settings.
-        jobs: how many at a time; see `run_jobs`.
-        progress: told the name of a cloud and how far its fit is. With one job only: workers do not tell.
-        report: told what became of each, as it ends.
-
-    Returns:
-        What became of each: what its ``run.json`` holds, or why it failed.
-
-    Raises:
-        InputError: several jobs need Ray.
-        Interrupted: Ctrl-C, in a single process.
-        KeyboardInterrupt: Ctrl-C, with several workers.
+    ``jobs`` run at a time, see `run_jobs`; ``progress`` is called with a single job only, ``report`` after each fit.
     """
     check_jobs(jobs)
     out.mkdir(parents=True, exist_ok=True)
@@ -125,7 +95,7 @@ def format_fits(outcomes: Sequence[FitOutcome]) -> str:
 
 
 def _fit(job: FitJob, progress: Report | None = None) -> dict[str, Any]:
-    """Fit one cloud, or what is left of it → what its ``run.json`` holds."""
+    """Fit one cloud, or resume it → its record."""
     if job.resume and is_fitted(job.directory):
         return read_record(job.directory)
     resume = job.resume and (job.directory / STATE_FILE).is_file()

@@ -1,8 +1,4 @@
-"""Level 0 as a judge of its cloud: outliers and wrong normals, which the finer levels do not see.
-
-A small network with a few hundred steps does not bend to single points, nor to a patch of normals that point the other
-way than all around it: what it made of the whole says what is wrong with the parts.
-"""
+"""Outliers and wrong normals of a cloud, found by its level 0: a small network averages over single points."""
 
 from __future__ import annotations
 
@@ -20,8 +16,6 @@ from torch import Tensor
 from ...datasets.clouds.cleaning.outliers import agreement, unsupported
 from ...neural_fields import Field
 
-__all__ = ["Review", "ReviewOptions", "review_points"]
-
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
@@ -31,23 +25,17 @@ Rows = NDArray[np.int64]
 class ReviewOptions:
     """Numbers of `review_points`."""
 
-    # Largest |f_0| in units of its robust scale: half of a sound cloud's errors are below 0.67, and what a coarse
-    # level misses of fine parts is above 8; so is every stray that is worth finding.
+    # Largest |f_0| in units of its robust scale; half of the errors of a clean cloud are below 0.67.
     far: float = 8.0
     mad: float = 1.4826  # a Gaussian's standard deviation over its median magnitude
-    against: float = -0.7  # cosine between a normal and the gradient of level 0, below which the normal may be flipped
-    opposed: float = -0.3  # and the mean of its neighbours', along its own
-    # Estimated normals are wrong in whole patches, whose members have each other for neighbours: a patch is turned if
-    # the neighbours round it are of another mind. Where data contradict each other a field is flat: its slope says
-    # how sure it is, and it must be this much against the normal.
-    slope: float = -0.5
+    against: float = -0.7  # cosine between a normal and the gradient, below which the normal may be flipped
+    opposed: float = -0.3  # cosine between a flipped normal and the mean of its neighbours'
+    slope: float = -0.5  # ∇f along a normal of a patch, below which it may be flipped: flat fields are unsure
     neighbors: int = 12
-    level: float = 0.3  # sine of the elevation of an edge between neighbours on the same sheet
+    level: float = 0.3  # sine of the elevation of an edge between neighbours on one sheet
     contradicted: float = -0.3  # mean agreement across a patch's rim
-    # Largest share of a patch's neighbours that are beyond its rim, times the root of its number of points: 1.5 for a
-    # disc, for a disc of n points has a rim of 2 √(πn) spacings, which edges of 1.3 spacings cross (those to 12
-    # neighbours, in the mean). Where it is more, there are two sheets with opposite normals, rightly, that are hardly
-    # a spacing apart.
+    # Share of neighbours beyond the rim times the root of the number of points: 1.5 for a disc, more where two sheets
+    # with rightly opposite normals are hardly a spacing apart.
     ragged: float = 3.0
 
 
@@ -55,17 +43,11 @@ REVIEW = ReviewOptions()
 
 
 class Review(NamedTuple):
-    """Which points of a cloud the next levels must not see as they are; each ``(N,)``.
-
-    Attributes:
-        dropped: outliers.
-        turned: kept points whose normals are to be turned round.
-        scale: the robust scale of |f_0| at the points.
-    """
+    """The outliers, and the kept points whose normals are to be turned, ``(N,)`` each."""
 
     dropped: Mask
     turned: Mask
-    scale: float
+    scale: float  # robust scale of |f_0| at the points
 
     def record(self) -> dict[str, Any]:
         """Counts for ``run.json``."""
@@ -88,22 +70,12 @@ def review_points(
     patches: bool = False,
     options: ReviewOptions = REVIEW,
 ) -> Review:
-    """Judge a cloud by the level that was fitted to it.
+    """Find outliers and flipped normals of a cloud by the level 0 of its fit.
 
-    An outlier is a point that the level passes at more than `far` times the robust scale, that has another normal than
-    the field there, and that neither half of its neighbours nor points about as sparse support: fine parts that the
-    level misses support themselves. A flipped normal opposes the field's gradient and its neighbours' mean normal,
-    which the gradient follows. A patch of flipped normals opposes the gradient, and the normals beside it.
-
-    Args:
-        points: ``(N, 3)``.
-        normals: ``(N, 3)``.
-        coarse: its level 0 judges.
-        device: where the field is.
-        outliers: whether to look for outliers.
-        turn: whether to look for flipped normals, each on its own.
-        patches: whether to look for patches of them too: the signs are guesses, not measured ones.
-        options: numbers of the algorithm.
+    An outlier is further from the zero level than `far` robust scales, has a normal unlike the gradient, and no support
+    by neighbours: fine parts that the level misses support themselves. A flipped normal opposes the gradient and the
+    mean normal of its neighbours, which the gradient follows. With ``patches``, where signs were guessed, patches of
+    normals that oppose the gradient and the normals around them are turned too.
     """
     jets = [coarse.jet(part.to(device), level=0) for part in points.split(1 << 16)]
     value = torch.cat([jet.value for jet in jets]).cpu()
@@ -130,10 +102,10 @@ def review_points(
 
 
 def _patches(points: Float64, normals: Float64, against: Mask, options: ReviewOptions = REVIEW) -> Mask:
-    """Which normals ``(N, 3)``, of those ``against`` ``(N,)`` the field, are patches that their neighbours contradict.
+    """Which normals ``(N, 3)``, of those ``against`` ``(N,)`` the field, form patches that their neighbours contradict.
 
-    Neighbours on the same sheet agree by ``⟨n_i, n_j⟩ − 2 ⟨e, n_i⟩ ⟨e, n_j⟩ / |e|²``, e being the edge between them:
-    1 on any arc of a circle, −1 where one of them is turned.
+    Neighbours on one sheet agree by ``⟨n_i, n_j⟩ − 2 ⟨e, n_i⟩ ⟨e, n_j⟩ / |e|²`` with the edge e between them: 1 on any
+    arc of a circle, −1 where one of them is turned.
     """
     rows, turned = np.flatnonzero(against), np.zeros(len(points), bool)
     if not len(rows) or len(points) <= options.neighbors:
@@ -157,7 +129,7 @@ def _patches(points: Float64, normals: Float64, against: Mask, options: ReviewOp
 
 
 def _joined(rows: Rows, near: Rows, linked: Mask, count: int) -> NDArray[np.intp]:
-    """The patch ``(m,)`` of each of ``rows``, which ``linked`` neighbours ``near`` ``(m, k)`` join."""
+    """The patch ``(m,)`` of each of ``rows``: components of the graph of ``linked`` neighbours ``near`` ``(m, k)``."""
     start, end = np.repeat(rows, near.shape[1])[linked.ravel()], near[linked]
     graph = coo_array((np.ones(len(start), np.int8), (start, end)), shape=(count, count))
     label = connected_components(graph.tocsr(), directed=False)[1][rows]

@@ -1,7 +1,4 @@
-"""``fit``: from an oriented point cloud to a multiscale SDF, level by level (paper Sec. 3.2).
-
-What the coarse level shows to be wrong with the cloud, outliers and flipped normals, the finer ones do not see.
-"""
+"""``fit``: from an oriented point cloud to a multiscale SDF, level by level (paper Sec. 3.2)."""
 
 from __future__ import annotations
 
@@ -18,39 +15,32 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
-from ...datasets.clouds.large import Merging
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
 from ..surface.surface import thinned
 from ..training.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
-from ..training.machine import choose_device, environment, peak_memory
+from ..training.machine import choose_device, peak_memory
 from ..training.progress import reported, silent
 from ..training.result import Run
-from ..training.scaffold import BUDGET, Budget, affordable, least_share, step_seconds
+from ..training.scaffold import BUDGET, Budget, Training, affordable, least_share
 from ..training.settings import FitConfig
 from ..training.trainer import (
     Interrupted,
     Report,
     StopFlag,
     Trainer,
-    checkpoint_of,
     load_compiler,
     parameter_count,
     restore_frozen,
     stop_on_signals,
-    without_prefix,
 )
-from .band import Band, band_of, with_wrong_sides
 from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
-from .heldout import JUDGE, Judge, held_out
-from .level import LEVEL, LevelObjective, calm_omega, new_level
-from .review import Review, review_points
-from .samples import DOMAIN, Source, banded_sources, first_sources
+from .level import JUDGE, LEVEL, Judge, LevelObjective, calm_omega, held_out, new_level
+from .review import review_points
+from .samples import DOMAIN, Band, Source, band_of, banded_sources, first_sources, with_wrong_sides
 from .unoriented import Places, Signs, fits_better, give_signs, signed
 
-__all__ = ["FitConfig", "Review", "Run", "fit", "fit_moved", "prepare", "review_points"]
-
-GUESSED = ("winding", "propagation")  # what gives estimated normals signs that may be wrong in whole patches
+GUESSED = ("winding", "propagation")  # orientations of estimated normals that may be wrong in whole patches
 
 Cloud = PointCloud | str | Path | NDArray[np.floating]
 LevelDone = Callable[[MultiscaleSDF, Similarity], object]
@@ -70,12 +60,11 @@ def fit(
     Args:
         cloud: a file, a `PointCloud`, or an array ``(N, 3)`` or ``(N, 6)`` of points (and normals).
         config: settings; the defaults are those of the ``default`` preset.
-        out: run directory for the field, the checkpoints and ``run.json``; None writes nothing. What another run left
-            there stays until the cloud has been read and found to be usable.
+        out: run directory for the field, the checkpoints and ``run.json``; None writes nothing. An older run there is
+            replaced only after the cloud has been read and checked.
         resume: continue the interrupted run in ``out`` with its own settings; ``config`` is then ignored.
-        progress: called now and then with how far the training is.
-        level_done: called with the field of all levels so far when one is finished, to show it, say; and with the
-            similarity to input coordinates.
+        progress: called repeatedly with the progress of the training.
+        level_done: called after each level with the field so far and the similarity from input coordinates.
 
     Raises:
         InputError: the cloud cannot be read or used, or there is nothing to resume.
@@ -91,19 +80,7 @@ def fit(
 def fit_moved(
     file: Path, config: FitConfig, *, out: Path, name: str, progress: Report | None = None
 ) -> Run[MultiscaleSDF]:
-    """`fit` a cloud that was made for the run, and lies in its directory.
-
-    Args:
-        file: the cloud.
-        config: settings.
-        out: run directory.
-        name: of its copy there, from the first checkpoint on.
-        progress: see `fit`.
-
-    Raises:
-        InputError: see `fit`.
-        Interrupted: see `fit`.
-    """
+    """`fit` a cloud file that was made for the run; the run directory keeps a copy of it as ``name``."""
     folder = RunFolder(out)
     folder.keep(name, file.read_bytes())
     return _fit(folder, file, config, source=str(out / name), progress=progress)
@@ -119,9 +96,10 @@ def _fit(
     level_done: LevelDone | None = None,
 ) -> Run[MultiscaleSDF]:
     config = folder.config(FitConfig, config)
-    device = choose_device(config.device)
-    budget, points = Budget(config.time_budget), _as_cloud(cloud)
-    with reported(progress, "reading the cloud"):
+    choose_device(config.device)  # a missing device is reported before a large cloud is read
+    budget, report = Budget(config.time_budget), progress or silent
+    points = _as_cloud(cloud)
+    with reported(report, "reading the cloud"):
         raw, merging = load_cloud(
             points,
             limit=config.merge_above,
@@ -130,13 +108,11 @@ def _fit(
             columns=config.columns,
             drop_noise=config.drop_noise,
         )
-    with reported(progress, "preparing the cloud"):
+    with reported(report, "preparing the cloud"):
         prepared = prepare(raw, config)
     load_compiler()
-    fitting = _Fitting(prepared, source or raw.source, config, device, folder, budget, merging)
-    fitting.reading = raw.reading
-    fitting.report = progress or silent
-    fitting.level_done = level_done
+    origin = {"reading": raw.reading, "merging": None if merging is None else dataclasses.asdict(merging)}
+    fitting = _Fitting(prepared, source or raw.source, origin, config, folder, budget, report, level_done)
     with folder.writing(), stop_on_signals() as flag:
         if folder.resume:
             fitting.restore()
@@ -144,11 +120,7 @@ def _fit(
 
 
 def prepare(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
-    """`prepare_cloud` as the settings of a fit ask for it.
-
-    Raises:
-        InputError: see `prepare_cloud`.
-    """
+    """`prepare_cloud` with the settings of a fit."""
     given = config.normals
     return prepare_cloud(
         cloud,
@@ -157,7 +129,7 @@ def prepare(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
         isolation=config.isolation,
         drop_outliers=config.drop_outliers,
         turn_normals=config.turn_normals,
-        smooth_noise=config.smooth_noise and given != "none",  # along which normals, level 0 says first
+        smooth_noise=config.smooth_noise and given != "none",  # without normals: after `give_signs`
     )
 
 
@@ -171,108 +143,89 @@ def _as_cloud(cloud: Cloud) -> PointCloud | str | Path:
     return PointCloud(points=array[:, :3].astype(np.float64), normals=normals, source="array")
 
 
-class _Fitting:
-    """One fit under way: the frozen levels, and the records of their stages."""
+class _Fitting(Training[FitConfig, MultiscaleSDF]):
+    """One fit under way; ``origin`` is the part of the record on how the file was read and merged."""
 
     def __init__(
         self,
         cloud: OrientedCloud,
         source: str,
+        origin: dict[str, Any],
         config: FitConfig,
-        device: torch.device,
         folder: RunFolder,
         budget: Budget,
-        merging: Merging | None,
+        report: Report,
+        level_done: LevelDone | None,
     ) -> None:
-        self.cloud, self.source, self.config = cloud, source, config
-        self.device, self.folder, self.merging = device, folder, merging
-        self.budget, self.preparation_seconds = budget, time.monotonic() - budget.started
-        self.report: Report = silent
-        self.reading = ""
-        self.costs: dict[int, float] = {}  # measured seconds of a step, by level
+        super().__init__(config, folder, budget, report)
+        self.cloud, self.source, self.origin, self.level_done = cloud, source, origin, level_done
+        self.preparation_seconds = time.monotonic() - budget.started
+        self.similarity = cloud.similarity
         self.fingerprint = digest_of((cloud.points, cloud.normals))
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
-        self.index: CloudDistance | None = None  # of the points above
-        self.held = torch.zeros(len(self.points), dtype=torch.bool)  # those of them that residual levels leave out
-        self.signs: Signs | None = None  # that the points without normals were given
-        self.spacing = 0.0  # of all of them
-        self.frozen: MultiscaleSDF | None = None
-        self.errors = torch.empty(0)  # of the last frozen level, at the input points
-        self.stages: list[dict[str, Any]] = []
-        self.trainer_state: dict[str, Tensor] = {}
-        self.level_done: LevelDone | None = None
-        # Of the level under way, and of the cloud's index; fewer than the settings' where a time budget leaves no more.
+        self.index: CloudDistance | None = None  # of the points that the level learns from
+        self.held = torch.zeros(len(self.points), dtype=torch.bool)  # points held out of residual levels
+        self.signs: Signs | None = None  # given to the points without normals
+        self.spacing = 0.0  # of all points
+        self.errors = torch.empty(0)  # of the last frozen level, at all points
+        # Samples of each kind, and points of the index: less than configured under a short time budget.
         self.samples = self.filling = config.samples
 
     def run(self, flag: StopFlag) -> Run[MultiscaleSDF]:
+        """Train all levels that there is time for."""
         if not self.stages and not self.trainer_state:
             self.find_signs(flag)
         self.keep_support()
-        for level in range(len(self.stages), self.config.num_levels):
-            share = self.share(level)
+        levels = self.config.num_levels
+        for level in range(len(self.stages), levels):
+            left, training = self.budget.left(), 1 - BUDGET.sampling_share
+            share = self.share(level, self.config.steps[:levels], left, training=training)
             if share is None:
-                self.budget.leave_out(level, self.config.num_levels)
+                self.budget.leave_out(level, levels)
                 break
             self.train_level(level, share, flag)
         assert self.frozen is not None
-        record = self.folder.finish(self.frozen, self.cloud.similarity, self.record(finished=True))
-        return Run(self.frozen.cpu(), self.cloud.similarity, self.folder.out, record)
+        record = self.folder.finish(self.frozen, self.similarity, self.record(finished=True))
+        return Run(self.frozen.cpu(), self.similarity, self.folder.out, record)
 
     def find_signs(self, flag: StopFlag) -> None:
-        """Let a network say which way normals point whose signs nobody knows for sure."""
+        """Orient normals of unknown or doubtful sign with `give_signs`."""
         if self.config.normals != "none" and self.cloud.report.oriented_by not in GUESSED:
             return
-        asked = self.config.normals == "none"
+        unsigned = self.config.normals == "none"
         places = Places.around(CloudDistance(self.points, self.normals), seed=self.config.seed)
-        if not asked and not places.contested:
+        if not unsigned and not places.contested:
             return
-        signs = give_signs(
-            self.points,
-            self.normals,
-            self.config,
-            device=self.device,
-            places=places,
-            flag=flag,
-            report=self.report,
-        )
+        about = {"device": self.device, "places": places, "flag": flag, "report": self.report}
+        signs = give_signs(self.points, self.normals, self.config, **about)
         if signs is None:
             self.save(self.grown(new_level(self.config, 0, residual=False), None), None)
             raise Interrupted(self.folder.out)
-        if asked or fits_better(self.cloud, signs):
+        if unsigned or fits_better(self.cloud, signs):
             self.take_signs(signs)
 
     def take_signs(self, signs: Signs) -> None:
-        """Turn normals as was found, and smooth the noise along them, if that was left until now."""
+        """Turn the normals; of a cloud without normals, smooth the noise along them."""
         self.signs = signs
         self.cloud = signed(self.cloud, signs, smooth=self.config.normals == "none" and self.config.smooth_noise)
         self.points, self.normals = torch.from_numpy(self.cloud.points), torch.from_numpy(self.cloud.normals)
 
     def keep_support(self) -> None:
-        """Keep the points that are fitted in the run."""
+        """Write the fitted points to the run directory."""
         if self.folder.out is not None:
             self.folder.keep_tensors(SUPPORT_FILE, thinned(self.points.numpy()))
 
-    def share(self, level: int) -> float | None:
-        """Seconds for samples and training of a level; infinite without a budget, None if it is not worth beginning."""
-        left, steps = self.budget.left(), self.config.steps[: self.config.num_levels]
-        if left is None:
-            return math.inf
-        training, begun = 1 - BUDGET.sampling_share, bool(self.trainer_state)
-        return self.budget.share(left, level, steps, self.cost, training=training, begun=begun)
+    def timed_step(self, level: int) -> Callable[[], Tensor]:
+        """See `Training.timed_step`."""
+        siren = new_level(self.config, level, residual=False).to(self.device)
+        points = torch.rand(self.config.batch, 3, generator=torch.Generator().manual_seed(0))
+        points = ((2 * points - 1) * DOMAIN).to(self.device)
 
-    def cost(self, level: int) -> float:
-        """Measured seconds of a training step of a level."""
-        if level not in self.costs:
-            siren = new_level(self.config, level, residual=False).to(self.device)
-            points = torch.rand(self.config.batch, 3, generator=torch.Generator().manual_seed(0))
-            points = ((2 * points - 1) * DOMAIN).to(self.device)
+        def step() -> Tensor:
+            jet = siren.jet(points)
+            return jet.value.square().mean() + jet.gradient.square().mean()
 
-            def step() -> Tensor:
-                jet = siren.jet(points)
-                return jet.value.square().mean() + jet.gradient.square().mean()
-
-            self.costs[level] = step_seconds(step, self.budget.left() or 0.0)
-        return self.costs[level]
+        return step
 
     def indexed(self, level: int) -> CloudDistance:
         """`distances` of a level, made once."""
@@ -280,7 +233,7 @@ class _Fitting:
         return self.index
 
     def train_level(self, level: int, share: float, flag: StopFlag) -> None:
-        """Make the samples of one level, train it, freeze it, in ``share`` seconds."""
+        """Make the samples of a level, train and freeze it, in ``share`` seconds (``inf``: no limit)."""
         started = time.monotonic()
         with reported(self.report, f"level {level}: samples"):
             if share < math.inf and level == 0 and not self.trainer_state:
@@ -302,22 +255,14 @@ class _Fitting:
         seconds = None if share == math.inf else self.training_seconds(level, share - sampling_seconds)
         rate = config.learning_rates[level]
         objective = LevelObjective(siren, sources, learning_rate=rate, generator=generator, judge=judge)
-        trainer = Trainer(
-            objective,
-            stage=f"level {level}",
-            steps=config.steps[level],
-            seconds=seconds,
-        )
-        if self.trainer_state:
-            trainer.restore(self.trainer_state)
-            self.trainer_state = {}
-        if not trainer.run(flag, report=self.report, save=lambda: self.save(self.grown(siren, delta), trainer)):
+        trainer = Trainer(objective, stage=f"level {level}", steps=config.steps[level], seconds=seconds)
+        if not self.take_steps(trainer, flag, lambda: self.grown(siren, delta)):
             raise Interrupted(self.folder.out)
         verdict = objective.take_best()
         self.frozen = self.grown(siren, delta).requires_grad_(False)
         review = self.review() if level == 0 else None
         if level == 0 and config.hold_out:
-            self.index = None  # the next level leaves some points out
+            self.index = None  # residual levels hold points out
         before, self.errors = self.errors, self.values_at_cloud()
         silenced = level > 0 and _rms(self.errors) > LEVEL.worse * _rms(before)
         if verdict is not None:
@@ -344,7 +289,7 @@ class _Fitting:
                 "steps": trainer.step,
                 "ended_by_time_budget": trainer.ended_early and not objective.hopeless,
                 "silenced": silenced,
-                "held_out": None if verdict is None else verdict.record(level, scale=self.cloud.similarity.scale),
+                "held_out": None if verdict is None else verdict.record(level, scale=self.similarity.scale),
                 "losses": trainer.losses,
                 **({} if review is None else {"review": review}),
                 **self.surface_errors(),
@@ -352,60 +297,60 @@ class _Fitting:
         )
         self.save(self.frozen, None)
         if self.level_done is not None:
-            self.level_done(self.frozen, self.cloud.similarity)
+            self.level_done(self.frozen, self.similarity)
 
     def sources(
         self, index: CloudDistance, delta: float | None, config: FitConfig, generator: torch.Generator
     ) -> list[Source]:
-        """The samples of the next level; those of a residual level lie in the band of half-width ``delta``."""
+        """Samples of the next level; of a residual level, in the band of half-width ``delta``."""
         if self.frozen is None or delta is None:
             return first_sources(index, config, generator=generator, device=self.device)
         return banded_sources(index, self.frozen, delta, config, generator=generator, name=self.source)
 
+    def affordable_count(self, index: CloudDistance, delta: float | None, seconds: float) -> int:
+        """How many samples of each kind can be made in ``seconds``, see `affordable`."""
+        generator = torch.Generator().manual_seed(0)
+
+        def make(count: int) -> list[Source]:
+            return self.sources(index, delta, dataclasses.replace(self.config, samples=count), generator)
+
+        return affordable(make, self.config.samples, seconds)
+
     def affordable_filling(self, share: float) -> int:
-        """Points of the index that level 0 has time for, if it gets ``share`` seconds in all."""
+        """Points of the index that fit into the ``share`` seconds of level 0."""
         full = self.config.samples
         if not self.config.between or full <= len(self.points):
             return full
-        index, generator = CloudDistance(self.points, self.normals), torch.Generator().manual_seed(0)
-        return affordable(
-            lambda count: self.sources(index, None, dataclasses.replace(self.config, samples=count), generator),
-            full,
-            BUDGET.sampling_share / 2 * share,
-        )
+        index = CloudDistance(self.points, self.normals)
+        return self.affordable_count(index, None, BUDGET.sampling_share / 2 * share)
 
     def affordable_samples(
         self, level: int, share: float, started: float, index: CloudDistance, delta: float | None
     ) -> int:
-        """Samples of each kind that a level has time for, which began at ``started``."""
+        """Samples of each kind that fit into the ``share`` seconds of a level, which began at ``started``."""
+        full = self.config.samples
         if share == math.inf:
-            return self.config.samples
+            return full
         spare = share - self.config.steps[level] * self.cost(level)
-        generator, full = torch.Generator().manual_seed(0), self.config.samples
-        count = affordable(
-            lambda count: self.sources(index, delta, dataclasses.replace(self.config, samples=count), generator),
-            full,
-            max(BUDGET.sampling_share * share, spare) - (time.monotonic() - started),
-        )
+        left = max(BUDGET.sampling_share * share, spare) - (time.monotonic() - started)
+        count = self.affordable_count(index, delta, left)
         if count < full:
             note = f"level {level} learns from {count:,} samples of each kind instead of {full:,}"
             self.budget.notes.append(note)
         return count
 
     def training_seconds(self, level: int, left: float) -> float:
-        """Seconds for the steps of a level of which ``left`` remain: at least so many that there is a surface."""
-        steps, took = self.config.steps[level], 0.0
-        if self.trainer_state:
-            took = float(self.trainer_state["progress"][1])
+        """Seconds for the steps of a level: those ``left``, but enough for a usable surface."""
+        steps = self.config.steps[level]
         least = least_share(steps) * steps * self.cost(level)
         if left < least:
             self.budget.notes.append(f"the time was up before level {level}, which is trained briefly all the same")
-        return took + max(left, least)
+        return self.elapsed + max(left, least)
 
     def distances(self, level: int) -> CloudDistance:
-        """The points that are trained on, and where they are sparse, what they say of the places between them.
+        """The points that a level learns from, densified where they are sparse.
 
-        Nobody judges level 0, so it learns from all of them: a voxel may be all that there is of a small face.
+        Level 0 is not judged, so no point is held out of it: a small face may lie in a single voxel.
         """
         config, all_points = self.config, self.points.numpy()
         noise, guessed = self.cloud.noise, self.cloud.estimated
@@ -420,17 +365,17 @@ class _Fitting:
         return dense_distance(points, normals, omega=omega, count=self.filling, **about)
 
     def next_band(self) -> Band:
-        """The band around the last frozen level (Eq. 5), inside the one before: under noise it could be wider."""
+        """The band around the last frozen level (Eq. 5), no wider than the one before."""
         config, level = self.config, len(self.stages)
         assert self.frozen is not None
         band = band_of(self.errors, epsilon=config.epsilon, quantile=config.quantile)
         if level == 1 and config.quantile is None:
-            asked = {"epsilon": config.epsilon, "count": self.filling, "seed": config.seed, "device": self.device}
-            band = with_wrong_sides(band, self.errors, self.indexed(level), self.frozen, **asked)
+            about = {"epsilon": config.epsilon, "count": self.filling, "seed": config.seed, "device": self.device}
+            band = with_wrong_sides(band, self.errors, self.indexed(level), self.frozen, **about)
         return band.within(self.stages[-1]["delta"], self.errors)
 
     def judge(self, delta: float, surface: Source) -> Judge | None:
-        """What judges a residual level, by the weights of its loss on the surface; None if no point was held out."""
+        """The judge of a residual level, with its loss weights on the surface; None without enough held-out points."""
         if not self.held.any():
             return None
         assert self.frozen is not None
@@ -442,19 +387,13 @@ class _Fitting:
         return judge if judge.count >= JUDGE.fewest / 2 else None
 
     def review(self) -> dict[str, Any]:
-        """Take out of the data, or turn round, what level 0 shows to be wrong → counts for the record."""
+        """Drop outliers and turn normals by level 0 → counts for the record."""
         config = self.config
         turn = config.turn_normals and config.normals != "file"
         assert self.frozen is not None
-        found = review_points(
-            self.points,
-            self.normals,
-            self.frozen,
-            device=self.device,
-            outliers=config.drop_outliers,
-            turn=turn,
-            patches=turn and self.cloud.report.oriented_by in (*GUESSED, "level"),
-        )
+        patches = turn and self.cloud.report.oriented_by in (*GUESSED, "level")
+        about = {"device": self.device, "outliers": config.drop_outliers, "turn": turn, "patches": patches}
+        found = review_points(self.points, self.normals, self.frozen, **about)
         if found.dropped.any() or found.turned.any():
             kept, turned = torch.from_numpy(~found.dropped), torch.from_numpy(found.turned)
             self.normals = torch.where(turned[:, None], -self.normals, self.normals)[kept]
@@ -465,13 +404,13 @@ class _Fitting:
 
     @torch.no_grad()
     def values_at_cloud(self) -> Tensor:
-        """Values of the finest frozen level at the input points → ``(n,)`` on the CPU."""
+        """Values ``(n,)`` of the finest frozen level at the points, on the CPU."""
         assert self.frozen is not None
         return torch.cat([self.frozen.value(part.to(self.device)).cpu() for part in self.points.split(1 << 18)])
 
     def surface_errors(self) -> dict[str, float]:
-        """|f| at the input points, in input units: how closely the level passes by them."""
-        scale = self.cloud.similarity.scale
+        """|f| at the points, in input units."""
+        scale = self.similarity.scale
         return {"rms_at_points": _rms(self.errors) * scale, "max_at_points": float(self.errors.abs().max()) * scale}
 
     def grown(self, siren: Siren, delta: float | None) -> MultiscaleSDF:
@@ -480,56 +419,43 @@ class _Fitting:
             return MultiscaleSDF(siren, [], []).to(self.device)
         return self.frozen.with_level(siren, delta=delta).to(self.device)
 
-    def save(self, field: MultiscaleSDF, trainer: Trainer[LevelObjective] | None) -> None:
-        """Write a usable field and all that `restore` needs."""
-        tensors = checkpoint_of(self.frozen, trainer)
-        if self.signs is not None:
-            tensors["signs.turned"] = torch.from_numpy(self.signs.turned)
-        kept = {"samples": self.samples, "filling": self.filling, "notes": self.budget.notes}
+    def kept(self) -> dict[str, Any]:
+        """See `Training.kept`."""
         signs = None if self.signs is None else self.signs.record()
-        progress = {"fingerprint": self.fingerprint, "stages": self.stages, "signs": signs, **kept}
-        self.folder.save(field, self.cloud.similarity, self.record(finished=False), tensors, progress)
+        return {"samples": self.samples, "filling": self.filling, "signs": signs}
+
+    def kept_tensors(self) -> dict[str, Tensor]:
+        """See `Training.kept_tensors`."""
+        return {} if self.signs is None else {"signs.turned": torch.from_numpy(self.signs.turned)}
 
     def restore(self) -> None:
-        """Take up an interrupted run; see `RunFolder.restore`."""
+        """Take up an interrupted run."""
         mismatch = f"{self.source}: not the cloud that {self.folder.path} was fitted to; resume with that cloud"
-        tensors, progress = self.folder.restore(self.fingerprint, mismatch)
-        self.stages, full = progress["stages"], self.config.samples
+        tensors, progress = self.restored(mismatch)
+        full = self.config.samples
         self.samples, self.filling = progress.get("samples") or full, progress.get("filling") or full
-        self.budget.notes = progress.get("notes", [])
         signs = progress.get("signs")
         if signs is not None:
             self.take_signs(Signs(tensors["signs.turned"].numpy(), signs["slope"], signs["witness"]))
-        omegas = [stage.get("omega") for stage in self.stages]  # older runs have the configuration's
+        omegas = [stage.get("omega") for stage in self.stages]  # runs of older versions have the configured ones
         levels = [new_level(self.config, level, residual=False, omega=omega) for level, omega in enumerate(omegas)]
         if levels:
             empty = MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1)).to(self.device)
             self.frozen = restore_frozen(empty, tensors)
-            self.review()  # again: it follows from the cloud and level 0
+            self.review()  # not stored: it follows from the cloud and level 0
             self.errors = self.values_at_cloud()
-        self.trainer_state = without_prefix("trainer.", tensors)
-        took = sum(stage["sampling_seconds"] + stage["training_seconds"] for stage in self.stages)
-        self.budget.before = took + (float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0)
 
     def record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
         return {
-            "finished": finished,
             **named_cloud(self.source, self.folder.path),
-            "reading": self.reading,
-            "merging": None if self.merging is None else dataclasses.asdict(self.merging),
+            **self.origin,
             "cleaning": dataclasses.asdict(self.cloud.report),
             "signs": None if self.signs is None else self.signs.record(),
-            "similarity": dataclasses.asdict(self.cloud.similarity),
-            "config": dataclasses.asdict(self.config),
-            "stages": self.stages,
-            "parameters": sum(stage["parameters"] for stage in self.stages),
-            "deltas": [stage["delta"] for stage in self.stages if stage["delta"] is not None],
             "preparation_seconds": round(self.preparation_seconds, 3),
-            "training_seconds": round(sum(s["sampling_seconds"] + s["training_seconds"] for s in self.stages), 3),
-            **self.budget.record(),
             "peak_memory": peak_memory(),
-            "environment": environment(self.device),
+            **self.common_record(finished=finished),
+            **self.stages_record(),
         }
 
 

@@ -1,21 +1,4 @@
-"""Level 0 without orientation: a network that learns a cloud whose normals have no signs, and gives them theirs.
-
-Where signs are not known the usual terms have many minima: |f| = d, |∇f| = 1 and |cos(∇f, N)| = 1 are met by either
-sign at each point, and whatever ripples a network begins with decide. So none of them is used. What is left is
-convex in the values: f = 0 at the points, f = ±d where space is surely out- or inside, with the distance d to the
-nearest point, and |f| ≤ d everywhere else, for no distance is longer than that to a sample of the surface. A smooth
-field that comes down from outside goes on falling through the first wall it meets. So the sides of a thin part, which
-both face the outside, get opposite gradients, and their normals are turned along them.
-
-Two witnesses with different faults say what is outside: `Exterior`, which holes of a scan mislead, and the winding
-numbers of normals that were oriented before, whose usual fault is to fill hollows. Each is believed in turn, and the
-field that has the steeper slope along the normals is kept: where it crosses a wall it has a slope of about 1, and none
-where both sides of the wall got the same sign. Where the slope is faint, signs come from the neighbours.
-
-Of bars that are thin for the network the field is faint all over, and its signs are worse than what came before: they
-change from point to point, and winding numbers fit them less where they were changed. So changes are taken only if
-winding numbers fit them better there, by far.
-"""
+"""Signs of normals: a network that is trained without them, and the normals turned along its gradient."""
 
 from __future__ import annotations
 
@@ -41,8 +24,6 @@ from .cloud import CloudDistance
 from .level import new_level
 from .samples import SAMPLING, spread_points
 
-__all__ = ["STAGE", "STAGES", "Places", "SignOptions", "Signs", "fits_better", "give_signs", "signed"]
-
 Float32 = NDArray[np.float32]
 
 
@@ -55,12 +36,12 @@ class SignOptions:
     samples: int = 50_000
     rate: float = 2e-3
     points: float = 2.0  # weight of f = 0 at the points, in units of that of known distances
-    settled: float = 0.25  # of the steps, after which the regions that the outside does not reach get their signs
-    clear: float = 0.1  # mean slope of the field into a region, from which on that has a sign
-    faint: float = 0.15  # mean slope at the points, below which it says nothing: that of an open sheet
+    settled: float = 0.25  # of the steps, after which enclosed regions get their signs
+    clear: float = 0.1  # mean slope of the field into a region, from which on it has a sign
+    faint: float = 0.15  # mean slope at the points, below which signs stay: that of an open sheet
     contradicted: float = 0.01  # share of the places
-    asked: int = 16_000  # points at which winding numbers are looked at
-    far: float = 0.05  # from the points, where wrong signs of a few of them no longer decide a winding number
+    tested: int = 16_000  # points at which winding numbers are compared
+    far: float = 0.05  # distance to the points, where a few wrong normals do not decide a winding number
 
 
 SIGNING = SignOptions()
@@ -70,17 +51,11 @@ STAGES = tuple(f"{STAGE} ({number} of 2)" for number in (1, 2))  # one for each 
 
 
 class Signs(NamedTuple):
-    """What `give_signs` finds.
+    """What `give_signs` finds."""
 
-    Attributes:
-        turned: ``(N,)`` the normals whose sign is not the one that they came with.
-        slope: mean of |⟨∇f, N⟩| at the points: about 1 where all is clear, near 0 where nothing is.
-        witness: of what is outside, who was believed: "exterior" or "winding".
-    """
-
-    turned: NDArray[np.bool_]
-    slope: float
-    witness: str
+    turned: NDArray[np.bool_]  # (N,) normals of the wrong sign
+    slope: float  # mean of |⟨∇f, N⟩| at the points: about 1 for clear signs, near 0 for none
+    witness: str  # source of the outside that was used: "exterior" or "winding"
 
     def record(self) -> dict[str, Any]:
         """For ``run.json``."""
@@ -94,23 +69,16 @@ class Signs(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Places around a cloud, and what its two witnesses say of them.
-
-    Attributes:
-        points: ``(M, 3)``.
-        distance: ``(M,)`` to the nearest point of the cloud.
-        region: ``(M,)`` see `Exterior.regions`.
-        winding: ``(M,)`` 1 where winding numbers say outside for sure, −1 inside, else 0.
-    """
+    """Places ``(M, 3)`` around a cloud, with two estimates of what is outside."""
 
     points: Tensor
-    distance: Tensor
-    region: Tensor
-    winding: Tensor
+    distance: Tensor  # (M,) to the nearest point of the cloud
+    region: Tensor  # (M,) see `Exterior.regions`
+    winding: Tensor  # (M,) 1 where winding numbers show the outside, −1 the inside, else 0
 
     @classmethod
     def around(cls, index: CloudDistance, *, seed: int) -> Places:
-        """Drawn as for level 0's distances."""
+        """The places and their estimates, drawn as distances of level 0."""
         points = spread_points(index, SIGNING.samples, torch.Generator().manual_seed(seed))
         distance = torch.from_numpy(index.nearest(points.numpy())).float().clamp(min=1e-6)
         region = torch.from_numpy(Exterior(index.points.astype(np.float64)).regions(points.double().numpy()))
@@ -120,7 +88,7 @@ class Places(NamedTuple):
 
     @property
     def contested(self) -> bool:
-        """Whether the witnesses contradict each other, or there is a hollow or another part whose sign is in doubt."""
+        """Whether the estimates contradict each other, or several enclosed regions are large."""
         inside = float(((self.region == OUTER_REGION) & (self.winding < 0)).float().mean())
         enclosed = torch.bincount(self.region)[OUTER_REGION + 1 :]
         return inside > SIGNING.contradicted or int((enclosed > SIGNING.contradicted * len(self.region)).sum()) > 1
@@ -137,20 +105,15 @@ def give_signs(
     report: Report | None = None,
     options: SignOptions = SIGNING,
 ) -> Signs | None:
-    """Which normals point inward, by a network that is not told.
+    """Which normals ``(N, 3)`` point inward, by networks that are trained on the points without them; None if stopped.
 
-    Args:
-        points: ``(N, 3)`` in the unit sphere.
-        normals: ``(N, 3)`` unit normals; their signs are those of one of the witnesses, and of nothing else.
-        config: the network is its level 0, and drawn from its seed.
-        device: that trains.
-        places: see `Places.around`; None to draw them.
-        flag: asks to stop.
-        report: told of the training, as the stages `STAGES`.
-        options: numbers of the algorithm.
+    With unknown signs |f| = d, |∇f| = 1 and |cos(∇f, N)| = 1 have many minima. The terms here are convex in the values:
+    f = 0 at the points, f = ±d at places that are surely out- or inside, and |f| ≤ d elsewhere. A smooth field that
+    falls from outside goes on falling through the first wall, so both sides of a thin part get opposite gradients.
 
-    Returns:
-        What was found; None if it was asked to stop.
+    What is outside comes from winding numbers in one network, which tend to fill hollows, and from `Exterior` in the
+    other, which holes mislead. The network with the steeper slope along the normals counts: about 1 across a wall, and
+    0 where both sides got one sign. Where the slope is faint, signs come from neighbours.
     """
     places = places or Places.around(CloudDistance(points, normals), seed=config.seed)
     outside = (places.region == OUTER_REGION).float()
@@ -177,39 +140,29 @@ def give_signs(
 
 
 def fits_better(cloud: OrientedCloud, signs: Signs, options: SignOptions = SIGNING) -> bool:
-    """Whether these signs fit the cloud better than its own, by far.
+    """Whether ``signs`` fit the cloud much better than its own.
 
-    Winding numbers are ½ at points whose normals are right. They are asked where normals were turned and nowhere else,
-    for of a small patch that is wrong the rest of a large cloud hardly knows. Where the misfit is not less by far,
-    signs have been spoilt.
-
-    Args:
-        cloud: as it was prepared.
-        signs: of its normals.
-        options: numbers of the algorithm.
+    Winding numbers are ½ at points with right normals. They are evaluated at turned normals only, as a small patch
+    hardly changes them elsewhere. Networks see thin bars as faint, and would spoil their signs.
     """
     turned = cloud.points[signs.turned]
     if not len(turned):
         return False
-    turned = turned[spread(turned.astype(np.float64), options.asked)]
+    turned = turned[spread(turned.astype(np.float64), options.tested)]
     after = np.where(signs.turned[:, None], -cloud.normals, cloud.normals)
     return _misfit(cloud.points, after, turned) < WINDING.much_less * _misfit(cloud.points, cloud.normals, turned)
 
 
 def _misfit(points: Float32, normals: Float32, at: Float32) -> float:
-    """How far winding numbers are from ½ at some of the points, in the root mean square."""
+    """Root mean square of the winding number minus ½ at some of the points."""
     index = CloudDistance(torch.from_numpy(points), torch.from_numpy(normals))
     return float(np.sqrt(np.square(index.winding_number(at) - 0.5).mean()))
 
 
 def signed(cloud: OrientedCloud, signs: Signs, *, smooth: bool) -> OrientedCloud:
-    """The cloud with the normals turned that have the wrong sign.
+    """The cloud with normals turned by ``signs``; with ``smooth``, its noise is then smoothed along them.
 
-    Args:
-        cloud: as it was prepared.
-        signs: of its normals.
-        smooth: whether noise is smoothed along them now: along wrong ones, it would move the sides of a thin wall
-            onto each other.
+    Smoothing along wrong signs would move the sides of a thin wall onto each other.
     """
     points, noise, deviation = cloud.points.astype(np.float64), cloud.noise, 0.0
     normals = np.where(signs.turned[:, None], -cloud.normals, cloud.normals).astype(np.float64)
@@ -229,17 +182,9 @@ def signed(cloud: OrientedCloud, signs: Signs, *, smooth: bool) -> OrientedCloud
 
 
 class _Unoriented(Objective):
-    """What is said above, for one witness.
+    """The loss of `give_signs`: ``sign`` ``(M,)`` of the distances at the places, 0 for unknown.
 
-    Args:
-        siren: the network.
-        points: ``(N, 3)`` of the cloud.
-        places: around it.
-        sign: ``(M,)`` of the known distances, 0 where it is not known.
-        region: ``(M,)`` of those beyond `OUTER_REGION` the signs follow from the field on its way; None: they stay.
-        generator: draws the batches.
-        device: that trains.
-        options: numbers of the algorithm.
+    With ``region`` ``(M,)``, those beyond `OUTER_REGION` get their signs from the field during training.
     """
 
     def __init__(
@@ -282,7 +227,7 @@ class _Unoriented(Objective):
 
     @torch.no_grad()
     def _settle(self, region: Tensor) -> None:
-        """Give each enclosed region the sign of the mean of f/d in it, where places near the points count most."""
+        """Give each enclosed region the sign of the mean of f/d in it, weighted by 1/d²."""
         value = torch.cat([self.siren.value(part) for part in self.places.split(1 << 16)])
         weight = self.distance.square().reciprocal() * (region > OUTER_REGION)
         count = int(region.max()) + 1

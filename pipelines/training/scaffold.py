@@ -185,6 +185,10 @@ class Training(ABC, Generic[C, F]):
         """What a resumed run needs beside the stages, as JSON."""
         return {}
 
+    def kept_tensors(self) -> Mapping[str, Tensor]:
+        """The tensors that a resumed run needs beside the levels and the trainer's state."""
+        return {}
+
     def common_record(self, *, finished: bool) -> dict[str, Any]:
         """What the records of all trainings hold."""
         return {
@@ -215,7 +219,7 @@ class Training(ABC, Generic[C, F]):
 
     def save(self, field: Field, trainer: Trainer[Any] | None) -> None:
         """Write a usable field and all that `restored` needs."""
-        tensors = checkpoint_of(self.frozen, trainer)
+        tensors = {**checkpoint_of(self.frozen, trainer), **self.kept_tensors()}
         progress = {"fingerprint": self.fingerprint, "stages": self.stages, "notes": self.budget.notes, **self.kept()}
         self.folder.save(field, self.similarity, self.record(finished=False), tensors, progress)
 

@@ -54,7 +54,6 @@ def test_a_plane_is_filled_exactly() -> None:
 def test_a_sphere_is_filled_to_second_order() -> None:
     radius, count = 0.6, 2000
     cloud = sample_sphere(count, radius=radius, seed=3)
-    assert cloud.normals is not None
     found = densified(cloud.points, cloud.points / radius, 5000)
     spacing = (4 * np.pi * radius**2 / count) ** 0.5
     assert len(found.points) > 4500
@@ -69,7 +68,6 @@ def test_a_sphere_is_filled_to_second_order() -> None:
 
 def test_saddles_are_filled_too() -> None:
     cloud = sample_torus(4000, seed=1)
-    assert cloud.normals is not None
     found = densified(cloud.points, cloud.normals, 5000)
     height = Torus().value(torch.from_numpy(found.points)).numpy()  # both have radii of 0.5 and 0.2
     spacing = (4 * np.pi**2 * 0.5 * 0.2 / 4000) ** 0.5
@@ -132,13 +130,6 @@ def test_contradictions_are_not_filled() -> None:
     assert len(found.points) < 50
     few = densified(points[:10], points[:10] / 0.5, 100)
     assert len(few.points) == 0
-
-
-def test_the_same_seed_finds_the_same_points() -> None:
-    points, normals = box(1000)
-    first, again, other = (densified(points, normals, 500, seed=seed).points for seed in (1, 1, 2))
-    assert np.array_equal(first, again)
-    assert len(first) != len(other) or not np.array_equal(first, other)
 
 
 def test_guessed_normals_are_not_followed_beyond_the_rim_of_a_strip() -> None:

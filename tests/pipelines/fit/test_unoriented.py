@@ -14,7 +14,7 @@ from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.fit.unoriented import SIGNING, STAGES, Places, Signs, fits_better, give_signs
 from mplicits.pipelines.training.settings import FitConfig
-from mplicits.pipelines.training.trainer import Interrupted, Progress, StopFlag
+from mplicits.pipelines.training.trainer import Interrupted, Progress
 from torch import Tensor
 
 SMALL = FitConfig(
@@ -41,7 +41,6 @@ def _less_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def ball(count: int, radius: float, *, inward: bool = False) -> tuple[Tensor, Tensor]:
     cloud = sample_sphere(count, radius=radius)
-    assert cloud.normals is not None
     normals = torch.from_numpy(cloud.normals)
     return torch.from_numpy(cloud.points).float(), -normals if inward else normals
 
@@ -58,9 +57,9 @@ def scrambled(normals: Tensor) -> tuple[Tensor, np.ndarray]:
 
 def test_a_ball_gets_its_normals_back() -> None:
     points, normals = ball(5000, 0.6)
+    assert not Places.around(CloudDistance(points, normals), seed=0).contested
     given, wrong = scrambled(normals)
     found = give_signs(points, given, SMALL, device=CPU)
-    assert found is not None
     assert found.clear
     assert (found.turned == wrong).all()
     assert found.record()["turned_normals"] == wrong.sum()
@@ -72,7 +71,6 @@ def test_the_hollow_of_a_thick_wall_is_outside_though_normals_filled_it() -> Non
     given = normals.clone()
     given[5000:] *= -1
     found = give_signs(points, given, SMALL, device=CPU)
-    assert found is not None
     assert found.turned[:5000].mean() < FEW
     assert found.turned[5000:].mean() > 1 - FEW
 
@@ -102,26 +100,14 @@ def test_a_small_patch_is_turned_though_the_rest_of_a_large_cloud_hardly_knows()
     assert not fits_better(cloud, Signs(patch, 1.0, "winding"))
 
 
-def test_a_ball_leaves_nothing_in_doubt() -> None:
-    assert not Places.around(CloudDistance(*ball(5000, 0.6)), seed=0).contested
-
-
 def test_of_an_open_sheet_all_stays() -> None:
     """There is no outside that is not also on its other side."""
     random = np.random.default_rng(0)
     points = torch.from_numpy(np.column_stack((random.uniform(-0.7, 0.7, (4000, 2)), np.zeros(4000)))).float()
     given, _ = scrambled(torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))
     found = give_signs(points, given, SMALL, device=CPU)
-    assert found is not None
     assert not found.clear
     assert not found.turned.any()
-
-
-def test_stops_when_asked() -> None:
-    points, normals = ball(500, 0.6)
-    flag = StopFlag()
-    flag.requested = True
-    assert give_signs(points, normals, SMALL, device=CPU, flag=flag) is None
 
 
 def spoilt(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
@@ -138,11 +124,10 @@ def test_a_fit_without_normals(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     told: list[Progress] = []
     config = replace(SMALL, batch=512, samples=4000)
     whole = fit(cloud, config, progress=told.append)
-    assert list(dict.fromkeys(progress.stage for progress in told))[1:5] == [
-        "preparing the cloud",
-        *STAGES,
-        "level 0: samples",
-    ]
+    levels = [f"level {level}{part}" for level in (0, 1) for part in (": samples", "")]
+    stages = ["reading the cloud", "preparing the cloud", *STAGES, *levels]
+    assert list(dict.fromkeys(progress.stage for progress in told)) == stages
+    assert [progress.fraction for progress in told if progress.stage == levels[0]] == [0.0, 1.0]
     assert whole.record["signs"]["turned_normals"] == pytest.approx(1000, abs=FEW * 2000)
     assert whole.record["cleaning"]["oriented_by"] == "level"
     distance = whole.world.distance(np.array([[0.6, 0, 0], [0, 0, 0], [0, -0.6, 0], [1, 1, 1.0]]))
