@@ -57,7 +57,7 @@ def _font() -> cv2.FontFace:
 
 Floats = NDArray[np.float32]
 
-DARK: Color = (0.20, 0.22, 0.27)  # ink on light paper
+INK: Color = (0.20, 0.22, 0.27)  # ink on light paper
 LIGHT: Color = (0.92, 0.93, 0.95)  # and on dark paper
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
@@ -81,7 +81,7 @@ def with_color_bar(
     # Lengths are in text heights.
     length = max(2, min(width - 2 * margin, 36 * text))
     paper = (1.0, 1.0, 1.0) if background is None else background
-    ink = DARK if float(np.mean(paper)) > 0.5 else LIGHT
+    ink = INK if float(np.mean(paper)) > 0.5 else LIGHT
     strip = np.empty((round(5.4 * text), width, 4), np.float32)
     strip[..., :3] = ink if background is None else paper
     strip[..., 3] = background is not None
@@ -145,7 +145,7 @@ def with_legend(
         top = text // 2 + line * row
         entry.draw(strip[top : top + row, left : left + entry.width])
         start = left + (entry.width + text // 2 if entry.width else 0)
-        _write(strip, entry.words, (start, top + row // 2), text, DARK)
+        _write(strip, entry.words, (start, top + row // 2), text, INK)
     return np.concatenate((picture, as_bytes(strip)))
 
 
@@ -179,8 +179,8 @@ def _entries(
 
 def _scale_bar(area: Floats) -> None:
     middle, tick = area.shape[0] // 2, area.shape[0] // 6
-    area[middle - 1 : middle + 1] = DARK
-    area[middle - tick : middle + tick, [0, 1, -2, -1]] = DARK
+    area[middle - 1 : middle + 1] = INK
+    area[middle - tick : middle + tick, [0, 1, -2, -1]] = INK
 
 
 def _ramp(area: Floats, reach: float) -> None:
