@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import InputError, MultiscaleSDF, SpaceTimeSDF
-from ..fit.level import new_level
+from ..fit.level import LEVEL, new_level
 from ..fit.samples import delta_of
 from ..training.folder import VELOCITY_FILE, RunFolder, digest_of, load_motion
 from ..training.progress import Progress, Report, reported, silent
@@ -206,7 +206,7 @@ class _Evolving(Training[EvolveConfig, SpaceTimeSDF]):
             return learn_start(known, config, generator, self.report, seconds=seconds).to(self.device)
         assert self.frozen is not None
         assert delta is not None
-        residual = new_level(config, level, residual=True, in_dim=4)
+        residual = new_level(config, level, residual=True, in_dim=4, gain=LEVEL.moving_gain)
         with torch.no_grad():
             residual.layers[0].weight[:, 3] *= config.time_gain  # pyright: ignore[reportIndexIssue]
         return self.frozen.with_level(residual.to(self.device), delta=delta).to(self.device)

@@ -25,8 +25,10 @@ from .samples import SQUARES, Samples, Source, Usual, with_previous
 class LevelOptions:
     """Numbers of `new_level` and `calm_omega`."""
 
-    residual_gain: float = 0.1  # output scale of an untrained residual, which starts close to the level before
-    small_gain: float = 0.01  # the same with robust normals: 0.1 tilts the normals of sparse clouds by degrees
+    residual_gain: float = (
+        0.01  # output scale of an untrained residual: 0.1 tilts the normals of sparse clouds by degrees
+    )
+    moving_gain: float = 0.1  # the same of a residual in space and time
     # Largest frequency of a residual times the standard deviation of smoothed noise: smoothing along estimated normals
     # leaves only noise at wavelengths below 2π/0.4 of it.
     calm: float = 0.4

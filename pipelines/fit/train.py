@@ -245,10 +245,9 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             if not self.trainer_state:
                 self.samples = self.affordable_samples(level, share, started, index, delta)
             config = dataclasses.replace(self.config, samples=self.samples)
-            gain = LEVEL.small_gain if config.robust_normals else LEVEL.residual_gain
             noisy = self.cloud.estimated and index.filled < 0.5
             omega = calm_omega(config, level, self.cloud.noise if noisy else 0.0)
-            siren = new_level(config, level, residual=level > 0, gain=gain, omega=omega).to(self.device)
+            siren = new_level(config, level, residual=level > 0, omega=omega).to(self.device)
             sources = self.sources(index, delta, config, generator)
             judge = None if delta is None else self.judge(delta, sources[0])
         sampling_seconds = time.monotonic() - started
