@@ -25,9 +25,8 @@ from .samples import SQUARES, Samples, Source, Usual, with_previous
 class LevelOptions:
     """Numbers of `new_level` and `calm_omega`."""
 
-    residual_gain: float = (
-        0.01  # output scale of an untrained residual: 0.1 tilts the normals of sparse clouds by degrees
-    )
+    # Output scale of an untrained residual: 0.1 tilts the normals of sparse clouds by degrees.
+    residual_gain: float = 0.01
     moving_gain: float = 0.1  # the same of a residual in space and time
     # Largest frequency of a residual times the standard deviation of smoothed noise: smoothing along estimated normals
     # leaves only noise at wavelengths below 2π/0.4 of it.
@@ -103,9 +102,9 @@ def held_out(
     owner = voxels_of(points, spacing, options=options)
     order = np.random.default_rng(seed).permutation(int(owner.max()) + 1)
     total = np.cumsum(np.bincount(owner)[order])
-    drawn = np.zeros(len(order), bool)
-    drawn[order[: int(np.searchsorted(total, count)) + 1]] = True
-    return drawn[owner]
+    chosen = np.zeros(len(order), bool)
+    chosen[order[: int(np.searchsorted(total, count)) + 1]] = True
+    return chosen[owner]
 
 
 def voxels_of(points: NDArray[np.float32], spacing: float, options: JudgeOptions = JUDGE) -> NDArray[np.int64]:
