@@ -25,6 +25,10 @@ from .common import folder_flag, measured_flags, noise_of, noisy_flags, number, 
 def _fit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
     noisy_flags(parser)
+    _compared_flags(parser)
+
+
+def _compared_flags(parser: argparse.ArgumentParser) -> None:
     measured_flags(parser, 512)
     number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write two pictures of all methods per shape")
@@ -56,12 +60,7 @@ def _uneven_arguments(parser: argparse.ArgumentParser) -> None:
     number(parser, "--points", whole(1000), 30_000, "points drawn on each")
     parser.add_argument("--density", choices=("curvature", "scanner", "patches"), help="what the density follows")
     number(parser, "--ratio", positive, 30.0, "largest over smallest density")
-    measured_flags(parser, 512)
-    number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
-    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write two pictures of all methods per shape")
-    folder_flag(parser)
-    add_flags(parser, "--json")
-    add_settings(parser, FitConfig)
+    _compared_flags(parser)
 
 
 def _uneven(arguments: argparse.Namespace) -> int:

@@ -90,7 +90,8 @@ def dense_distance(
         new_points, new_normals = new_points[kept], new_normals[kept]
     own_normals = torch.from_numpy(found.normals.astype(np.float32))
     dense = torch.cat((points.cpu(), new_points)), torch.cat((own_normals, new_normals))
-    return CloudDistance(*dense, **about, given=len(points), gaps=index.gaps, repaired=found.repaired)
+    gaps = np.concatenate((index.gaps, index.nearest_gap(new_points.numpy())[1]))
+    return CloudDistance(*dense, **about, given=len(points), gaps=gaps, repaired=found.repaired)
 
 
 def _on_solid(index: CloudDistance, x: NDArray[np.float32], options: BetweenOptions) -> Mask:

@@ -144,7 +144,7 @@ class CloudDistance:
         noise: standard deviation of the noise that was smoothed off the points.
         guessed: whether the normals were estimated from the points.
         given: number of the cloud's own points, the first ones; None for all. The others densify it.
-        gaps: ``(given,)`` spacing at each of those; None where there are no others.
+        gaps: ``(N,)`` spacing of the cloud's own points at each point; None where there are no others.
         repaired: normals of points on edges that were replaced by one side's, for the record.
         options: numbers of the algorithm.
     """
@@ -174,9 +174,6 @@ class CloudDistance:
         self.spacing = float(np.median(np.sqrt(self.areas)))
         self.given, self.repaired = len(points) if given is None else given, repaired
         self.gaps: Float32 = np.sqrt(self.areas) if gaps is None else gaps
-        if len(self.gaps) < len(self.points):
-            own = KDTree(self.points[: self.given]).query(self.points[self.given :], workers=-1)[1]
-            self.gaps = np.concatenate((self.gaps, self.gaps[np.asarray(own)]))
 
     @property
     def filled(self) -> float:
@@ -189,13 +186,13 @@ class CloudDistance:
 
     def nearest(self, x: NDArray[np.floating]) -> NDArray[np.float64]:
         """Distance ``(M,)`` from each of ``(M, 3)`` to the nearest point of the cloud."""
-        return np.concatenate([self._query(part, 1)[0] for part in _parts(x, self.options.rows)])
+        return self.nearest_gap(x)[0]
 
-    def beyond(self, x: NDArray[np.floating], gaps: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distances ``(M,)`` to the nearest point, and ``gaps`` times the spacing there."""
+    def nearest_gap(self, x: NDArray[np.floating]) -> tuple[NDArray[np.float64], Float32]:
+        """Distance ``(M,)`` from each of ``(M, 3)`` to the nearest point, and the spacing of the cloud's own there."""
         parts = [self._query(part, 1) for part in _parts(x, self.options.rows)]
         distance, index = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return distance, gaps * self.gaps[index].astype(np.float64)
+        return distance, self.gaps[index]
 
     def signed(self, x: Tensor, *, soft: float = CLOUD.soft) -> Tensor:
         """Signed distance ``(M,)`` of ``(M, 3)`` points on the CPU, negative inside.

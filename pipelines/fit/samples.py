@@ -244,8 +244,8 @@ def remote_samples(
         samples = with_previous(Samples(tried), field, delta, device=device)
         points = samples.points.cpu().numpy()
         assert samples.value is not None
-        distance, clear = cloud.beyond(points, options.clear)
-        far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > np.maximum(delta, clear))
+        distance, gap = cloud.nearest_gap(points)
+        far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > np.maximum(delta, options.clear * gap))
         depth = cloud.winding_number(points[far]) - 0.5
         sure = np.abs(depth) > (options.sure_guessed if cloud.guessed else options.sure)
         empty, unseen = (samples.take(torch.from_numpy(far[some]).to(device)) for some in (sure, ~sure))
@@ -436,6 +436,6 @@ def _wrong_sides(delta: float, cloud: CloudDistance, field: Field, places: Tenso
     points, value = places[beyond].numpy(), value[beyond]
     depth = cloud.winding_number(points) - 0.5
     wrong = (np.abs(depth) > SAMPLING.sure) & ((depth > 0) == (value.numpy() > 0))
-    distance, clear = cloud.beyond(points, SAMPLING.clear)
-    wrong &= distance > clear
+    distance, gap = cloud.nearest_gap(points)
+    wrong &= distance > SAMPLING.clear * gap
     return value[torch.from_numpy(wrong)]

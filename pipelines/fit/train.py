@@ -379,7 +379,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             return None
         assert self.frozen is not None
         points, normals = self.points[self.held], self.normals[self.held]
-        areas = torch.from_numpy(self.indexed(len(self.stages)).beyond(points.numpy(), 1.0)[1].astype(np.float32)) ** 2
+        areas = torch.from_numpy(self.indexed(len(self.stages)).nearest_gap(points.numpy())[1]) ** 2
         terms = {"data": surface.data, "normal": surface.normal, "usual": surface.usual}
         about = {"spacing": self.spacing, "areas": areas, "guessed": self.cloud.estimated}
         judge = Judge(points, normals, self.frozen, delta, **about, **terms)

@@ -91,7 +91,7 @@ def test_beside_the_rim_of_a_hole_discs_that_agree_go_on_where_the_surface_ends(
     assert (winding > 0.5 - CLOUD.doubt).all()
     assert (bowl.signed(beside) < 0).all()
     # Not of points that fill a sparse cloud in, which may go on beyond an edge.
-    filled = CloudDistance(points[below], normals[below], given=1, gaps=np.ones(1, np.float32))
+    filled = CloudDistance(points[below], normals[below], given=1)
     assert (filled.signed(beside) > 0).all()
     # Beyond the rim's reach, and where its discs are seen edge-on, nothing is better than winding numbers.
     remote = torch.tensor([[0.1, 0.0, 0.05], [0.0, 0.5, -0.05]]) * RADIUS
