@@ -1,7 +1,6 @@
 """Many clouds in one command: what is checked first, what fails alone, what is resumed."""
 
 import importlib.util
-import json
 import signal
 from pathlib import Path
 
@@ -23,10 +22,16 @@ SMALL = (
 
 @pytest.fixture
 def clouds(tmp_path: Path) -> list[Path]:
-    paths = [tmp_path / f"{name}.ply" for name in ("ball", "ring")]
-    write_cloud_ply(paths[0], sample_sphere(300))
-    write_cloud_ply(paths[1], sample_torus(300))
+    paths = [tmp_path / "ball.ply", tmp_path / "ring.ply"]
+    for path, cloud in zip(paths, (sample_sphere(300), sample_torus(300)), strict=True):
+        write_cloud_ply(path, cloud)
     return paths
+
+
+@pytest.fixture
+def broken(tmp_path: Path) -> Path:
+    (tmp_path / "broken.ply").write_text("ply\nformat ascii 1.0\nend_header\n")
+    return tmp_path / "broken.ply"
 
 
 def weights(directory: Path) -> torch.Tensor:
@@ -37,9 +42,9 @@ def run(*words: object) -> int:
     return main(["fit", *map(str, words)])
 
 
-def test_a_run_for_each_and_one_failure(clouds: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    broken = tmp_path / "broken.ply"
-    broken.write_text("ply\nformat ascii 1.0\nend_header\n")
+def test_a_run_for_each_and_one_failure(
+    clouds: list[Path], broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "runs"
     assert run(clouds[0], broken, clouds[1], "-o", out, "--quiet", *SMALL) == 1
     table = capsys.readouterr().out.splitlines()
@@ -48,8 +53,8 @@ def test_a_run_for_each_and_one_failure(clouds: list[Path], tmp_path: Path, caps
     assert "vertex" in table[3]
     for name in ("ball", "ring"):
         assert find_field(out / name).is_file()
-        assert read_record(out / name)["finished"]
-        assert json.loads((out / name / "run.json").read_text())["config"]["steps"] == [30]
+        record = read_record(out / name)
+        assert (record["finished"], record["config"]["steps"]) == (True, [30])
 
 
 def test_what_is_wrong_is_told_before_any_work(
@@ -101,9 +106,9 @@ def test_interrupted_runs_are_resumed_and_finished_ones_left_alone(
 
 @pytest.mark.slow  # test_jobs has two workers in each run; here each loads everything for a fit
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is an extra")
-def test_two_workers_fit_as_one_does(clouds: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    broken = tmp_path / "broken.ply"
-    broken.write_text("ply\nformat ascii 1.0\nend_header\n")
+def test_two_workers_fit_as_one_does(
+    clouds: list[Path], broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(*clouds, "-o", tmp_path / "one", "--quiet", *SMALL) == 0
     assert run(clouds[0], broken, clouds[1], "-o", tmp_path / "two", "--jobs", 2, *SMALL) == 1
     said = capsys.readouterr()
@@ -114,12 +119,12 @@ def test_two_workers_fit_as_one_does(clouds: list[Path], tmp_path: Path, capsys:
         assert beside["rms_at_points"] == pytest.approx(alone["rms_at_points"], rel=1e-3)
 
 
-def test_force_keeps_what_is_there_until_the_new_cloud_is_usable(clouds: list[Path], tmp_path: Path) -> None:
+def test_force_keeps_what_is_there_until_the_new_cloud_is_usable(
+    clouds: list[Path], broken: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "run"
     assert run(clouds[0], "-o", out, "--quiet", *SMALL) == 0
     (out / STATE_FILE).write_bytes(b"of an interrupted run")
-    broken = tmp_path / "broken.ply"
-    broken.write_text("ply\nformat ascii 1.0\nend_header\n")
     assert run(broken, "-o", out, "--quiet", "--force", *SMALL) == 2
     assert (out / STATE_FILE).read_bytes() == b"of an interrupted run"
     assert run(clouds[1], "-o", out, "--quiet", "--force", *SMALL) == 0

@@ -8,8 +8,7 @@ import pytest
 import torch
 from mplicits.datasets import look_at
 from mplicits.datasets.views.images import PosedImage
-from mplicits.neural_fields import InputError, MultiscaleSDF, Similarity, Sphere, ViewColor
-from mplicits.neural_fields.networks.neus_mlp import NeusSDF
+from mplicits.neural_fields import InputError, Similarity, Sphere, ViewColor
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.neural_fields.volume.weights import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
@@ -28,10 +27,6 @@ def no_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def exact_scene() -> SceneModel:
     return SceneModel(Sphere(radius=0.5), ViewColor(0, width=8, depth=1), None, torch.zeros(3))
-
-
-def parameters(module: torch.nn.Module) -> int:
-    return sum(parameter.numel() for parameter in module.parameters())
 
 
 def test_the_uncertainty_begins_as_in_neus_and_can_be_trained() -> None:
@@ -77,11 +72,11 @@ def test_residuals_begin_near_zero() -> None:
 
 @pytest.mark.usefixtures("no_start")
 def test_the_papers_geometry_is_more_than_a_third_smaller_than_that_of_neus() -> None:
-    multiscale = build_scene(PAPER, has_masks=True).geometry
-    neus = build_scene(replace(PAPER, geometry="neus"), has_masks=True).geometry
-    assert isinstance(multiscale, MultiscaleSDF)
-    assert isinstance(neus, NeusSDF)
-    assert parameters(multiscale) <= (1 - 0.37) * parameters(neus)
+    multiscale, neus = (
+        sum(p.numel() for p in build_scene(replace(PAPER, geometry=name), has_masks=True).geometry.parameters())
+        for name in ("multiscale", "neus")
+    )
+    assert multiscale <= (1 - 0.37) * neus
 
 
 @pytest.mark.usefixtures("no_start")
@@ -91,7 +86,6 @@ def test_the_papers_geometry_is_more_than_a_third_smaller_than_that_of_neus() ->
         ("auto", True, False, 1.0),
         ("auto", False, True, 0.0),
         ("black", True, False, 0.0),
-        ("black", False, False, 0.0),
         ("white", False, False, 1.0),
         ("outside", True, True, 0.0),
     ],
@@ -132,7 +126,6 @@ def test_everything_is_trained_by_one_picture(half: bool, monkeypatch: pytest.Mo
     (seen.color.square().mean() + (seen.jet.gradient.norm(dim=-1) - 1).square().mean()).backward()
     missing = [name for name, p in model.named_parameters() if p.grad is None or not bool(p.grad.isfinite().all())]
     assert missing == []
-    assert model.variance.grad is not None
     assert float(model.variance.grad.abs()) > 0
 
 
@@ -174,7 +167,6 @@ def test_a_drawn_ray_is_that_of_its_pixel_with_its_colour_and_mask() -> None:
         eye, directions = picture.camera.moved(WORLD).rays()
         torch.testing.assert_close(rays.origins[rows], eye.expand(int(rows.sum()), 3), atol=1e-6, rtol=0)
         torch.testing.assert_close(rays.directions[rows], directions[y[rows], x[rows]], atol=1e-6, rtol=0)
-        assert picture.mask is not None
         mask = torch.from_numpy(picture.mask)[y[rows], x[rows]]
         torch.testing.assert_close(rays.mask[rows], mask, atol=1e-7, rtol=0)
 
