@@ -229,7 +229,7 @@ def test_a_verdict_in_words(falls: tuple[float, ...], judged: str, sure: str) ->
     assert words.startswith(f"level 2 {judged}: ")
     assert "distance 0.1 → 0.02 (surely less)" in words
     assert words.endswith(f"3 → 1.5° ({sure})")
-    assert "0.70" in verdict._replace(learnt=0.7).words(1)
+    assert "0.70" in verdict_of(1.5, 1.5)._replace(learnt=0.7).words(1)
     record = verdict.record(1, scale=10.0)
     assert (record["before"], record["after"]) == (2, 1)
     assert (record["distance"], record["angle"]) == ([0.1, 0.02], [3.0, 1.5])
