@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from mplicits.datasets import PointCloud
 from mplicits.datasets.synthetic.samples import sample_sphere
 from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.fit import describe
-from mplicits.pipelines.fit import level
+from mplicits.pipelines.fit.level import JUDGE, Error, Fall, Judge, LevelObjective, Verdict, held_out, standard_errors
 from mplicits.pipelines.fit.samples import Samples, Source, Usual, with_previous
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.trainer import Group, Trainer
@@ -26,10 +27,10 @@ def points(count: int) -> torch.Tensor:
     return torch.from_numpy(sample_sphere(count, radius=RADIUS).points).float()
 
 
-def judge_of(sphere: float, *, data: float = 100.0, normal: float = 3.0, guessed: bool = False) -> level.Judge:
+def judge_of(sphere: float, *, data: float = 100.0, normal: float = 3.0, guessed: bool = False) -> Judge:
     """Of a sphere's points, by a frozen sphere of another radius."""
     x, frozen = points(1000), Sphere(radius=sphere)
-    return level.Judge(x, x / RADIUS, frozen, 0.1, spacing=SPACING, data=data, normal=normal, guessed=guessed)
+    return Judge(x, x / RADIUS, frozen, 0.1, spacing=SPACING, data=data, normal=normal, guessed=guessed)
 
 
 def zero_siren(bias: float) -> Siren:
@@ -43,21 +44,19 @@ def zero_siren(bias: float) -> Siren:
 def test_whole_voxels_are_held_out() -> None:
     x = np.random.default_rng(0).uniform(-1, 1, (20_000, 3)).astype(np.float32)
     spacing = 0.1
-    held = level.held_out(x, spacing, 0.03)
-    size = np.bincount(
-        np.unique(np.floor(x / (level.JUDGE.voxel * spacing)), axis=0, return_inverse=True)[1].reshape(-1)
-    )
+    held = held_out(x, spacing, 0.03)
+    size = np.bincount(np.unique(np.floor(x / (JUDGE.voxel * spacing)), axis=0, return_inverse=True)[1].reshape(-1))
     assert 600 <= held.sum() <= 600 + size.max()
-    assert 600 <= level.held_out(x, spacing, 0.01).sum() <= 600 + size.max()  # a share would be two hundred
-    assert 400 <= level.held_out(x[:8000], spacing, 0.01).sum() <= 400 + size.max()  # and six hundred too many
-    cells = np.floor(x.astype(np.float64) / (level.JUDGE.voxel * spacing)).astype(np.int64)
+    assert 600 <= held_out(x, spacing, 0.01).sum() <= 600 + size.max()  # a share would be two hundred
+    assert 400 <= held_out(x[:8000], spacing, 0.01).sum() <= 400 + size.max()  # and six hundred too many
+    cells = np.floor(x.astype(np.float64) / (JUDGE.voxel * spacing)).astype(np.int64)
     inside, outside = ({tuple(cell) for cell in cells[rows].tolist()} for rows in (held, ~held))
     assert not inside & outside
-    assert (level.held_out(x, spacing, 0.03) == held).all()
-    assert (level.held_out(x, spacing, 0.03, seed=1) != held).any()
-    assert level.held_out(x[:3000], spacing, 0.01).sum() >= level.JUDGE.fewest  # fewer tell nothing
-    for few, share in ((x, 0.0), (x[: 10 * level.JUDGE.fewest - 1], 0.03)):
-        assert not level.held_out(few, spacing, share).any()
+    assert (held_out(x, spacing, 0.03) == held).all()
+    assert (held_out(x, spacing, 0.03, seed=1) != held).any()
+    assert held_out(x[:3000], spacing, 0.01).sum() >= JUDGE.fewest  # fewer tell nothing
+    for few, share in ((x, 0.0), (x[: 10 * JUDGE.fewest - 1], 0.03)):
+        assert not held_out(few, spacing, share).any()
 
 
 def test_the_loss_at_held_out_points_is_that_of_equation_4() -> None:
@@ -69,10 +68,10 @@ def test_the_loss_at_held_out_points_is_that_of_equation_4() -> None:
     assert judge.errors(zero_siren(-OFF)).mean().loss == pytest.approx(0, abs=1e-6)  # 3 (1 − cos), in float32
     assert judge.errors(zero_siren(OFF)).mean().loss == pytest.approx(100 * (2 * OFF) ** 2, rel=1e-4)
     x = points(1000)
-    outside = level.Judge(x, x, Sphere(radius=0.1), 0.1, spacing=SPACING, data=1.0, normal=1.0)  # of the band
+    outside = Judge(x, x, Sphere(radius=0.1), 0.1, spacing=SPACING, data=1.0, normal=1.0)  # of the band
     assert outside.count == 0
     assert not outside.verdict(outside.without, 1.0).better
-    against = level.Judge(x, -x / RADIUS, Sphere(radius=RADIUS), 0.1, spacing=SPACING, data=1.0, normal=3.0)
+    against = Judge(x, -x / RADIUS, Sphere(radius=RADIUS), 0.1, spacing=SPACING, data=1.0, normal=3.0)
     assert against.before.loss == pytest.approx(2 * 3.0, rel=1e-6)
     assert against.before.angle == pytest.approx(180, abs=0.1)
 
@@ -83,7 +82,7 @@ def test_the_angle_at_held_out_points_is_their_mean() -> None:
     across = torch.nn.functional.normalize(torch.linalg.cross(normals, torch.tensor([[0.3, 0.5, -0.8]])), dim=1)
     angle = torch.deg2rad(torch.linspace(0, 8, 1001) ** 2 / 8)[:, None]
     tilted = angle.cos() * normals + angle.sin() * across
-    judge = level.Judge(x, tilted, Sphere(radius=RADIUS), 0.1, spacing=SPACING, data=1.0, normal=1.0)
+    judge = Judge(x, tilted, Sphere(radius=RADIUS), 0.1, spacing=SPACING, data=1.0, normal=1.0)
     assert judge.before.angle == pytest.approx(8 / 3, rel=1e-3)
     assert judge.before.loss == pytest.approx(float((1 - angle.cos()).mean()), rel=1e-3)
 
@@ -91,18 +90,18 @@ def test_the_angle_at_held_out_points_is_their_mean() -> None:
 def test_large_errors_count_as_the_level_counts_them() -> None:
     x = points(1000)
     terms = {"data": 100.0, "normal": 3.0, "usual": Usual(data=1e-5, normal=1e-3)}
-    judge = level.Judge(x, -x / RADIUS, Sphere(radius=RADIUS - OFF), 0.1, spacing=SPACING, **terms)
+    judge = Judge(x, -x / RADIUS, Sphere(radius=RADIUS - OFF), 0.1, spacing=SPACING, **terms)
     turned, away = 1e-3 * ((1 + 4 / 1e-3) ** 0.5 - 1), 1e-5 * ((1 + 2 * OFF**2 / 1e-5) ** 0.5 - 1)  # 1 − cos = 2
     assert judge.before.loss == pytest.approx(3 * turned + 100 * away, rel=1e-4)
 
 
-def objective(judge: level.Judge, target: float) -> level.LevelObjective:
+def objective(judge: Judge, target: float) -> LevelObjective:
     """Learns a constant ``target`` everywhere."""
     x = points(2000)
     samples = with_previous(Samples(x, torch.full((2000,), target)), Sphere(radius=RADIUS - OFF), 0.1, device=CPU)
     source = Source("surface", samples, 256, 1e4, 0.0, 0.0)
     generator = torch.Generator().manual_seed(0)
-    return level.LevelObjective(zero_siren(0.0), [source], learning_rate=1e-2, generator=generator, judge=judge)
+    return LevelObjective(zero_siren(0.0), [source], learning_rate=1e-2, generator=generator, judge=judge)
 
 
 def test_the_best_weights_are_kept_and_checkpoints_keep_them() -> None:
@@ -140,25 +139,21 @@ def test_training_ends_where_held_out_points_say_that_everything_gets_worse() ->
 def test_what_chance_may_have_done_is_not_sure() -> None:
     falls, apart = torch.tensor([0.0, 2.0]).repeat(50), torch.arange(100)
     # Their mean is 1, and their standard deviation √(100 / 99).
-    assert level.standard_errors(falls, apart) == pytest.approx(1 / (100 / 99) ** 0.5 * 10, rel=1e-6)
-    assert level.standard_errors(-falls, apart) == pytest.approx(-level.standard_errors(falls, apart))
+    assert standard_errors(falls, apart) == pytest.approx(1 / (100 / 99) ** 0.5 * 10, rel=1e-6)
+    assert standard_errors(-falls, apart) == pytest.approx(-standard_errors(falls, apart))
     for fall, expected in ((1.0, math.inf), (-1.0, -math.inf), (0.0, 0.0), (math.nan, -math.inf)):
-        assert level.standard_errors(torch.full((100,), fall), apart) == expected
-    assert level.standard_errors(torch.zeros(0), torch.zeros(0, dtype=torch.int64)) == 0
+        assert standard_errors(torch.full((100,), fall), apart) == expected
+    assert standard_errors(torch.zeros(0), torch.zeros(0, dtype=torch.int64)) == 0
 
 
 def test_points_of_one_voxel_count_once() -> None:
     falls = torch.from_numpy(np.random.default_rng(0).normal(0.3, 1.0, 100))
-    alone = level.standard_errors(falls, torch.arange(100))
-    assert level.standard_errors(falls.repeat(4), torch.arange(100).repeat(4)) == pytest.approx(alone, rel=1e-12)
-    assert level.standard_errors(falls.repeat(4), torch.arange(400)) == pytest.approx(
-        alone * (399 / 99) ** 0.5, rel=1e-12
-    )
+    alone = standard_errors(falls, torch.arange(100))
+    assert standard_errors(falls.repeat(4), torch.arange(100).repeat(4)) == pytest.approx(alone, rel=1e-12)
+    assert standard_errors(falls.repeat(4), torch.arange(400)) == pytest.approx(alone * (399 / 99) ** 0.5, rel=1e-12)
     # In one voxel, a wave cancels itself.
     waves = 0.1 + torch.tensor([1.0, -1.0], dtype=torch.float64).repeat(50)
-    assert (
-        level.standard_errors(waves, torch.arange(100) // 2) > 1e6 > 2 > level.standard_errors(waves, torch.arange(100))
-    )
+    assert standard_errors(waves, torch.arange(100) // 2) > 1e6 > 2 > standard_errors(waves, torch.arange(100))
 
 
 def test_a_level_goes_back_to_what_was_surely_better() -> None:
@@ -181,9 +176,9 @@ def test_a_few_far_points_send_no_level_back(guessed: bool, monkeypatch: pytest.
     angle = judge.without.angle + 0.1  # normals that were estimated may be wrong
     distances = {-0.5: 0.98 * judge.without.distance, -1.0: few}
 
-    def errors(siren: Siren) -> level.Each:
+    def errors(siren: Siren) -> Any:
         distance = distances[float(siren.output.bias.detach())]
-        return level.Each(judge.data * distance.square(), distance, angle, torch.ones_like(distance))
+        return judge.without._replace(loss=judge.data * distance.square(), distance=distance, angle=angle)
 
     monkeypatch.setattr(judge, "errors", errors)
     for bias, done in ((-0.5, 0.5), (-1.0, 1.0)):
@@ -195,11 +190,9 @@ def test_a_few_far_points_send_no_level_back(guessed: bool, monkeypatch: pytest.
     assert verdict.better == guessed
 
 
-def verdict_of(distance: float, angle: float, at: float = 1.0) -> level.Verdict:
+def verdict_of(distance: float, angle: float, at: float = 1.0) -> Verdict:
     """With falls of so many standard errors."""
-    return level.Verdict(
-        500, level.Error(2.0, 0.01, 3.0), level.Error(1.0, 0.002, 1.5), at, level.Fall(distance, angle)
-    )
+    return Verdict(500, Error(2.0, 0.01, 3.0), Error(1.0, 0.002, 1.5), at, Fall(distance, angle))
 
 
 def test_a_level_is_kept_if_it_is_surely_better() -> None:
@@ -248,10 +241,10 @@ def test_no_level_of_a_fit_is_worse_at_held_out_points_than_the_one_before(noise
     run = fit(PointCloud(x, normals.astype(np.float32), None, "ball"), config, out=tmp_path / "run")
     stage = run.record["stages"][1]
     judged = stage["held_out"]
-    assert judged["points"] >= level.JUDGE.fewest / 2
+    assert judged["points"] >= JUDGE.fewest / 2
     assert math.isfinite(judged["before"])
     falls = judged["fall_in_standard_errors"].values()
-    learns = min(falls) > 0 and judged["learnt"] < level.JUDGE.learnt
+    learns = min(falls) > 0 and judged["learnt"] < JUDGE.learnt
     assert stage["silenced"] == ((max(falls) <= 2 or min(falls) < -2) and not learns)
     assert judged["verdict"].startswith(f"level 1 {'set to zero' if stage['silenced'] else 'kept'}")
     assert judged["verdict"] in describe(tmp_path / "run")

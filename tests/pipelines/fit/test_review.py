@@ -128,9 +128,7 @@ def test_strays_and_flipped_normals_do_not_show_in_the_fit(fitted: Path, tmp_pat
     assert abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.05
 
 
-def test_meshing_drops_what_no_points_support_and_says_so(
-    fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_meshing_drops_what_no_points_support(fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     parts = [extract_mesh(Sphere(radius=radius), resolution=24) for radius in (0.98, 0.2)]
     faces = np.concatenate((parts[0].faces, parts[1].faces + len(parts[0].vertices)))
     both = Mesh(np.concatenate([part.vertices for part in parts]), faces)

@@ -258,17 +258,21 @@ def test_a_level_keeps_what_was_not_scanned(cloud: CloudDistance) -> None:
     assert len(whole.unseen) == len(whole.empty) == 0
 
 
+def with_next_level(cloud: CloudDistance, previous: MultiscaleSDF, omega: float, steps: int) -> tuple[list[str], Field]:
+    """Names of the sources of the level above ``previous``, and the field with it, trained for a moment."""
+    levels = {"widths": (8, 48), "depths": (1, 1), "omegas": (30.0, omega), "learning_rates": (1e-3, 2e-3)}
+    config = FitConfig(**levels, steps=(1, steps), batch=1500)
+    sources = module.banded_sources(cloud, previous, 0.05, config, generator=generator())
+    torch.manual_seed(0)
+    siren = train_level(1, sources, config, generator=generator())
+    return [source.name for source in sources], previous.with_level(siren, delta=0.05)
+
+
 @pytest.mark.slow
 def test_the_next_level_leaves_the_closing_of_a_hole_as_it_is() -> None:
-    config = FitConfig(
-        widths=(8, 48), depths=(1, 1), omegas=(30.0, 40.0), steps=(1, 100), learning_rates=(1e-3, 2e-3), batch=1500
-    )
-    cloud, delta = with_hole(), 0.05
-    previous = MultiscaleSDF(Sphere(radius=RADIUS + 0.02), [], [])  # wrong by 0.02 where there are points
-    sources = module.banded_sources(cloud, previous, delta, config, generator=generator())
-    assert [source.name for source in sources] == ["surface", "offset", "band", "unseen"]
-    torch.manual_seed(0)
-    field = previous.with_level(train_level(1, sources, config, generator=generator()), delta=delta)
+    cloud, previous = with_hole(), MultiscaleSDF(Sphere(radius=RADIUS + 0.02), [], [])  # off by 0.02 at the points
+    names, field = with_next_level(cloud, previous, 40.0, 100)
+    assert names == ["surface", "offset", "band", "unseen"]
     aside = torch.nn.functional.normalize(torch.randn(500, 2, generator=generator()), dim=1)
     cap = torch.cat((0.2 * torch.rand(500, 1) * aside, torch.ones(500, 1)), dim=1)
     cap = torch.nn.functional.normalize(cap, dim=1)
@@ -277,14 +281,9 @@ def test_the_next_level_leaves_the_closing_of_a_hole_as_it_is() -> None:
 
 
 def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> None:
-    config = FitConfig(
-        widths=(8, 48), depths=(1, 1), omegas=(30.0, 20.0), steps=(1, 150), learning_rates=(1e-3, 2e-3), batch=1500
-    )
-    previous, delta = MultiscaleSDF(Union(Sphere(radius=RADIUS), PHANTOM), [], []), 0.05
-    sources = module.banded_sources(cloud, previous, delta, config, generator=generator())
-    assert [source.name for source in sources] == ["surface", "offset", "band", "empty"]
-    torch.manual_seed(0)
-    field = previous.with_level(train_level(1, sources, config, generator=generator()), delta=delta)
+    previous = MultiscaleSDF(Union(Sphere(radius=RADIUS), PHANTOM), [], [])
+    names, field = with_next_level(cloud, previous, 20.0, 150)
+    assert names == ["surface", "offset", "band", "empty"]
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator()), dim=1)
     shell = torch.tensor([0.85, 0.0, 0.0]) + 0.1 * directions
     outside = shell[shell.norm(dim=1) > RADIUS + 0.1]
@@ -308,16 +307,13 @@ def test_near_a_cloud_of_guessed_normals_winding_numbers_tell_the_side() -> None
     assert (samples.distance.sign() != exact.sign())[clear].float().mean() < 0.1 / 8
     assert (samples.distance.abs() - exact.abs()).abs().max() < cloud.spacing
 
-    config = FitConfig(samples=8000)
-    sources = module.banded_sources(cloud, Sphere(radius=RADIUS - 0.01), delta, config, generator=generator())
+    config, previous = FitConfig(samples=8000), Sphere(radius=RADIUS - 0.01)
+    sources = module.banded_sources(cloud, previous, delta, config, generator=generator())
     assert [source.name for source in sources] == ["surface", "near", "band"]
-    assert {(source.normal, source.eikonal) for source in sources} == {
-        (0.1 * config.normal_weight, 0.2 * config.eikonal_weight)
-    }
+    weights = 0.1 * config.normal_weight, 0.2 * config.eikonal_weight
+    assert {(source.normal, source.eikonal) for source in sources} == {weights}
     fixed = module.Weights(normal=1.0, eikonal=2.0)
-    sources = module.banded_sources(
-        cloud, Sphere(radius=RADIUS - 0.01), delta, config, generator=generator(), weights=fixed
-    )
+    sources = module.banded_sources(cloud, previous, delta, config, generator=generator(), weights=fixed)
     assert {(source.normal, source.eikonal) for source in sources} == {(1.0, 2.0)}
 
 
@@ -360,35 +356,37 @@ def test_the_scales_of_errors_are_those_of_the_level_before(robust: bool) -> Non
     assert sources[0].usual.data == (pytest.approx(1e-4, rel=1e-4) if robust else np.inf)
 
 
-def test_delta_is_equation_5() -> None:
-    errors = torch.tensor([0.01, -0.02, 0.005, 0.0])
-    assert module.delta_of(errors, epsilon=0.3, quantile=1.0) == pytest.approx(1.3 * 0.02)
-    assert module.delta_of(errors, epsilon=0.3, quantile=0.75) == pytest.approx(1.3 * 0.01)
-    stray = torch.cat((torch.full((9999,), 0.01), torch.tensor([1.0])))
-    assert module.delta_of(stray, epsilon=0.3, quantile=1.0) == pytest.approx(1.3)
-    for quantile in (0.999, None):
-        assert module.delta_of(stray, epsilon=0.3, quantile=quantile) == pytest.approx(1.3 * 0.01)
-    normal = torch.randn(50_000, generator=torch.Generator().manual_seed(0))
-    assert module.delta_of(normal, epsilon=0.3, quantile=None) == pytest.approx(1.3 * float(normal.abs().max()))
+FOUR = torch.tensor([0.01, -0.02, 0.005, 0.0])
+STRAY = torch.cat((torch.full((9999,), 0.01), torch.tensor([1.0])))
+# More than one in a hundred: the 99th percentile is itself a stray's.
+STRAYS = torch.cat((torch.linspace(0, 0.01, 9500), torch.linspace(0.4, 1, 500)))
+NORMAL = torch.randn(50_000, generator=generator())
 
 
-def test_many_strays_do_not_widen_a_band() -> None:
-    """More than one in a hundred: the 99th percentile is itself a stray's."""
-    strays = torch.cat((torch.linspace(0, 0.01, 9500), torch.linspace(0.4, 1, 500)))
-    band = module.band_of(strays, epsilon=0.3, quantile=None)
-    assert band.delta == pytest.approx(1.3 * 0.01)
-    assert (band.rule, band.outside) == ("maximum but for strays", 500)
+@pytest.mark.parametrize(
+    ("errors", "quantile", "largest", "rule", "outside"),
+    [
+        (FOUR, 1.0, 0.02, "quantile", 0),
+        (FOUR, 0.75, 0.01, "quantile", 1),
+        (FOUR, None, 0.02, "maximum", 0),
+        (STRAY, 1.0, 1.0, "quantile", 0),
+        (STRAY, 0.999, 0.01, "quantile", 1),
+        (STRAY, None, 0.01, "maximum but for strays", 1),
+        (STRAYS, None, 0.01, "maximum but for strays", 500),
+        (NORMAL, None, float(NORMAL.abs().max()), "maximum", 0),
+        (torch.zeros(5), None, 1e-6 / 1.3, "maximum", 0),
+    ],
+)
+def test_delta_is_equation_5(errors: Tensor, quantile: float | None, largest: float, rule: str, outside: int) -> None:
+    band = module.band_of(errors, epsilon=0.3, quantile=quantile)
+    assert band.delta == pytest.approx(1.3 * largest)
+    assert (band.rule, band.outside) == (rule, outside)
 
 
-def test_bands_say_what_chose_them() -> None:
-    errors = torch.tensor([0.01, -0.02, 0.005, 0.0])
-    assert module.band_of(errors, epsilon=0.3, quantile=None).rule == "maximum"
-    by_quantile = module.band_of(errors, epsilon=0.3, quantile=0.75)
-    assert (by_quantile.rule, by_quantile.outside) == ("quantile", 1)
-    assert module.band_of(torch.zeros(5), epsilon=0.3, quantile=None).delta == 1e-6
-    assert by_quantile.within(None, errors) is by_quantile
-    assert by_quantile.within(0.07, errors) is by_quantile
-    assert by_quantile.within(0.006, errors) == module.Band(0.006, "no wider than the band before", 2)
+def test_a_band_is_no_wider_than_the_one_before() -> None:
+    band = module.band_of(FOUR, epsilon=0.3, quantile=0.75)
+    assert band.within(None, FOUR) is band.within(0.07, FOUR) is band
+    assert band.within(0.006, FOUR) == module.Band(0.006, "no wider than the band before", 2)
 
 
 def widened(field: Field, delta: float) -> module.Band:

@@ -79,9 +79,7 @@ def test_the_same_seed_gives_the_same_field(fitted: Path) -> None:
 
 
 @pytest.mark.parametrize(("level", "number"), [(0, signal.SIGINT), (1, signal.SIGTERM)])
-def test_an_interrupted_run_resumes_to_the_same_result(
-    fitted: Path, tmp_path: Path, level: int, number: signal.Signals
-) -> None:
+def test_an_interrupted_run_resumes_to_the_same(fitted: Path, tmp_path: Path, level: int, number: int) -> None:
     with pytest.raises(Interrupted, match="checkpoint"):
         fit(sphere_cloud(), SMALL, out=tmp_path, progress=interrupt(f"level {level}", 40, number))
     assert load_field(tmp_path / "field.safetensors").field.num_levels == level + 1  # what there is can be used
@@ -152,11 +150,9 @@ def test_levels_are_handed_out_as_they_are_finished() -> None:
     assert seen == [(1, run.similarity.scale), (2, run.similarity.scale)]
 
 
-def test_resume_refuses_another_cloud_or_nothing(tmp_path: Path, fitted: Path) -> None:
+def test_resume_refuses_another_cloud_or_nothing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"run\.json: no such file"):
         fit(sphere_cloud(), out=tmp_path / "none", resume=True)
-    with pytest.raises(InputError, match="nothing to resume"):
-        fit(sphere_cloud(), out=fitted, resume=True)
 
     with pytest.raises(Interrupted):
         fit(sphere_cloud(), SMALL, out=tmp_path, progress=interrupt("level 0", 20))

@@ -46,9 +46,8 @@ def test_a_model_trains_and_its_bands_follow(plugin: Any, name: str, capsys: pyt
     schedule = importlib.import_module(f"{PLUGIN}schedule").WarmCosineConfig().setup()
     schedulers = {"fields": schedule.get_scheduler(optimizer, 1.0)}
     trainer = SimpleNamespace(_start_step=40, config=SimpleNamespace(max_num_iterations=10))
-    callbacks = model.get_training_callbacks(
-        SimpleNamespace(trainer=trainer, optimizers=SimpleNamespace(schedulers=schedulers))
-    )
+    optimizers = SimpleNamespace(schedulers=schedulers)
+    callbacks = model.get_training_callbacks(SimpleNamespace(trainer=trainer, optimizers=optimizers))
     assert schedule.steps == 50
     assert schedule.factor(50) == pytest.approx(0.05)
     losses = []
@@ -133,12 +132,10 @@ def exported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, field: nn.Module) 
     stand_in(monkeypatch)
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     transform = np.concatenate([turn, [[1.0], [2.0], [3.0]]], axis=1)
-    outputs = SimpleNamespace(
-        dataparser_transform=torch.from_numpy(transform).float(), dataparser_scale=0.5, cameras=cameras([-0.05, 0.05])
-    )
-    pipeline = SimpleNamespace(
-        model=SimpleNamespace(field=field), datamanager=SimpleNamespace(train_dataparser_outputs=outputs)
-    )
+    moved = {"dataparser_transform": torch.from_numpy(transform).float(), "dataparser_scale": 0.5}
+    outputs = SimpleNamespace(**moved, cameras=cameras([-0.05, 0.05]))
+    data = SimpleNamespace(train_dataparser_outputs=outputs)
+    pipeline = SimpleNamespace(model=SimpleNamespace(field=field), datamanager=data)
     evaluation = sys.modules["nerfstudio.utils.eval_utils"]
     evaluation.eval_setup = lambda config, test_mode: (None, pipeline, config, 0)  # pyright: ignore[reportAttributeAccessIssue]
     config = tmp_path / "config.yml"
@@ -201,9 +198,7 @@ def test_undoing_the_move_of_the_data_is_exact() -> None:
     np.testing.assert_allclose(found.normals, normals, atol=1e-6)  # pyright: ignore[reportArgumentType]
 
 
-def test_what_cannot_be_exported(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_exports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match=r"no such file; expected the config.yml"):
         export_mesh(tmp_path / "none.yml", tmp_path / "mesh.ply")
     config, _ = exported(monkeypatch, tmp_path, nn.Identity())

@@ -67,9 +67,7 @@ def never(self: Replays, kind: Hashable, work: Callable[[], Mapping[str, Tensor]
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_replayed_steps_are_those_that_would_be_done(
-    name: str, images: PosedImages, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_replayed_steps_are_the_same(name: str, images: PosedImages, monkeypatch: pytest.MonkeyPatch) -> None:
     trainers = [replaying(images, name, torch.device("cpu")) for _ in range(2)]
     assert trainers[0].run()
     recorded = trainers[0].replays.recorded
@@ -83,9 +81,7 @@ def test_replayed_steps_are_those_that_would_be_done(
 
 # Which have all terms between them.
 @pytest.mark.parametrize("name", ["outside", pytest.param("cameras", marks=pytest.mark.slow), "depths"])
-def test_on_an_accelerator_the_host_never_waits_for_a_replayed_step(
-    name: str, images: PosedImages, accelerator: torch.device
-) -> None:
+def test_the_host_never_waits_for_a_replayed_step(name: str, images: PosedImages, accelerator: torch.device) -> None:
     here, there = (replaying(images, name, device) for device in (torch.device("cpu"), accelerator))
     assert here.run()
     if accelerator.type == "cuda":

@@ -28,6 +28,7 @@ SMALL = TextureConfig(
     width=48, depth=2, omega=15.0, steps=250, learning_rate=3e-3, batch=1024, band_batch=512, samples=4000, delta=0.1
 )
 BRIEF = replace(SMALL, steps=3)
+HERE = Similarity((5.0, 0.0, 0.0), 1.0)  # of the runs below
 
 
 def directions(count: int) -> NDArray[np.float64]:
@@ -168,9 +169,7 @@ def record_of(run: Path) -> dict[str, Any]:
 def run(tmp_path: Path) -> Path:
     directory = tmp_path / "run"
     directory.mkdir()
-    neural_fields.save_field(
-        directory / "field.safetensors", plane_field(), similarity=Similarity((5.0, 0.0, 0.0), 1.0)
-    )
+    neural_fields.save_field(directory / "field.safetensors", plane_field(), similarity=HERE)
     (directory / "run.json").write_text(json.dumps({"config": {}, "cloud": "plane.ply"}))
     return directory
 
@@ -201,12 +200,8 @@ def test_another_place_leaves_the_run_as_it_is(run: Path, cloud: Path, tmp_path:
     texture_run(run, cloud, BRIEF, out=tmp_path / "other.safetensors")
     assert (run / "run.json").read_text() == before
     assert not (run / TEXTURE_FILE).exists()
-    assert (
-        neural_fields.load_texture(
-            tmp_path / "other.safetensors", load_field(run / "field.safetensors").field
-        ).num_levels
-        == 1
-    )
+    geometry = load_field(run / "field.safetensors").field
+    assert neural_fields.load_texture(tmp_path / "other.safetensors", geometry).num_levels == 1
 
 
 def test_an_interrupted_training_leaves_a_usable_texture_and_continues_to_the_same(run: Path, cloud: Path) -> None:
@@ -240,7 +235,7 @@ def test_a_training_is_not_continued_with_other_colours_or_another_field(run: Pa
     with torch.no_grad():
         next(bent.parameters()).add_(1e-3)
     before = (run / "field.safetensors").read_bytes()
-    neural_fields.save_field(run / "field.safetensors", bent, similarity=Similarity((5.0, 0.0, 0.0), 1.0))
+    neural_fields.save_field(run / "field.safetensors", bent, similarity=HERE)
     with pytest.raises(InputError, match="not the field"):
         texture_run(run, cloud, resume=True)
     (run / "field.safetensors").write_bytes(before)
