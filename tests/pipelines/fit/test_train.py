@@ -166,14 +166,12 @@ def test_resume_refuses_another_cloud_or_nothing(tmp_path: Path) -> None:
 def test_a_budget_that_is_too_small_makes_less_and_says_so(tmp_path: Path) -> None:
     """400 thousand samples alone would take longer, and so would sixty steps of a (512, 4) level."""
     started = time.monotonic()
-    run = fit(sphere_cloud(), replace(LONG, time_budget=0.7), out=tmp_path)
+    fit(sphere_cloud(), replace(LONG, time_budget=0.7), out=tmp_path)
     assert time.monotonic() - started < 60  # on any machine: it is not three minutes
     record = read_record(tmp_path)
-    budget = record["budget"]
-    assert budget["seconds"] == 0.7
-    assert budget["left_out"] == [1]
-    assert run.field.num_levels == len(record["stages"]) == 1
-    stage = record["stages"][0]
+    budget, (stage,) = record["budget"], record["stages"]
+    assert (budget["seconds"], budget["left_out"]) == (0.7, [1])
+    assert load_field(tmp_path / "field.safetensors").field.num_levels == 1
     assert stage["steps"] > 0
     assert stage["ended_by_time_budget"]
     assert stage["samples"]["domain"] < LONG.samples

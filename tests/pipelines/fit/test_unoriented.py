@@ -13,7 +13,7 @@ from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.fit.unoriented import SIGNING, STAGES, Places, Signs, fits_better, give_signs
 from mplicits.pipelines.training.settings import FitConfig
-from mplicits.pipelines.training.trainer import Interrupted, Progress
+from mplicits.pipelines.training.trainer import Interrupted
 from torch import Tensor
 
 SMALL = replace(fits.SMALL, omegas=(20.0, 20.0), steps=(100, 30), normals="none")
@@ -37,6 +37,11 @@ def ball(count: int, radius: float, *, inward: bool = False) -> tuple[Tensor, Te
 
 def joined(*parts: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     return torch.cat([points for points, _ in parts]), torch.cat([normals for _, normals in parts])
+
+
+def prepared(part: tuple[Tensor, Tensor]) -> OrientedCloud:
+    points, normals = part
+    return prepare_cloud(PointCloud(points.double().numpy(), normals.numpy()), normals="file")
 
 
 def turned(cloud: OrientedCloud, which: np.ndarray) -> OrientedCloud:
@@ -71,8 +76,7 @@ def test_the_hollow_of_a_thick_wall_is_outside_though_normals_filled_it() -> Non
 
 
 def test_signs_are_taken_where_winding_numbers_fit_better_with_them() -> None:
-    points, normals = joined(ball(2500, 0.8), ball(1500, 0.6, inward=True))
-    cloud = prepare_cloud(PointCloud(points.double().numpy(), normals.numpy(), None, "shell"), normals="file")
+    cloud = prepared(joined(ball(2500, 0.8), ball(1500, 0.6, inward=True)))
     inner = np.arange(len(cloud)) >= 2500
     filled = turned(cloud, inner)
     assert fits_better(filled, Signs(inner, 1.0, "exterior"))
@@ -86,8 +90,7 @@ def test_signs_are_taken_where_winding_numbers_fit_better_with_them() -> None:
 
 
 def test_a_small_patch_of_a_large_cloud_is_turned() -> None:
-    points, normals = ball(20_000, 0.8)
-    cloud = prepare_cloud(PointCloud(points.double().numpy(), normals.numpy(), None, "ball"), normals="file")
+    cloud = prepared(ball(20_000, 0.8))
     patch = cloud.points[:, 2] > 0.995 * cloud.points[:, 2].max()
     assert 0 < patch.mean() < 0.005
     assert fits_better(turned(cloud, patch), Signs(patch, 1.0, "winding"))
@@ -113,13 +116,8 @@ def test_a_fit_without_normals(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
 
     monkeypatch.setattr("mplicits.pipelines.fit.train.prepare", spoilt)
     cloud = PointCloud(sample_torus(2000, major=0.6, minor=0.25).points)
-    told: list[Progress] = []
     config = replace(SMALL, batch=512, samples=4000)
-    whole = fit(cloud, config, progress=told.append)
-    levels = [f"level {level}{part}" for level in (0, 1) for part in (": samples", "")]
-    stages = ["reading the cloud", "preparing the cloud", *STAGES, *levels]
-    assert list(dict.fromkeys(progress.stage for progress in told)) == stages
-    assert [progress.fraction for progress in told if progress.stage == levels[0]] == [0.0, 1.0]
+    whole = fit(cloud, config)
     assert whole.record["signs"]["turned_normals"] == pytest.approx(1000, abs=FEW * 2000)
     assert whole.record["cleaning"]["oriented_by"] == "level"
     distance = whole.world.distance(np.array([[0.6, 0, 0], [0, 0, 0], [0, -0.6, 0], [1, 1, 1.0]]))

@@ -105,8 +105,6 @@ def test_the_entry_points_lead_to_the_methods(plugin: Any) -> None:
         assert set(method.config.optimizers) == groups
         config = method.config
         assert config.pipeline.model.sdf_field.learning_rate == config.optimizers["fields"]["optimizer"].lr
-        parser = config.pipeline.datamanager.dataparser
-        assert (parser.center_method, parser.scale_factor) == ("focus", 2.0)
 
 
 class Red(nn.Module):

@@ -287,7 +287,6 @@ def test_the_command_says_how_to_go_on(
         ("--starts 0.5 0.6", "starts: (0.5, 0.6); expected 0 first"),
         ("--starts 0 1", "starts: (0.0, 1.0); expected 0 first, then growing shares below 1"),
         ("--ryas 8", "unknown flag --ryas; did you mean '--rays'?"),
-        ("--preset fats", "did you mean 'fast'?"),
         ("--device abacus", "device"),
     ],
 )

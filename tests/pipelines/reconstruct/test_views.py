@@ -11,7 +11,7 @@ import torch
 import trimesh
 from mplicits.datasets import look_at
 from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
-from mplicits.datasets.synthetic.scenes import SCENES, render_view, scene_cameras
+from mplicits.datasets.synthetic.scenes import SCENES, render_view
 from mplicits.datasets.views.images import PosedImage
 from mplicits.datasets.views.writing import write_transforms
 from mplicits.neural_fields import Mesh, Similarity, Sphere, Union, extract_mesh, save_field
@@ -101,15 +101,13 @@ def test_photographs_are_judged_on_the_background_of_the_scene() -> None:
 
 def test_a_sharp_sphere_looks_like_its_exact_picture() -> None:
     model = exact_model()
-    scene = SCENES["painted-sphere"]()
-    camera = scene_cameras(scene, views=1, size=24, seed=3)[0]
-    color, mask = render_view(scene, camera, samples=1)
-    view = PosedImage("0.png", camera, color, mask)
+    (view,) = painted_sphere(1, 24).views
+    color, camera = view.color, view.camera
     told: list[tuple[int, int]] = []
     here = Similarity.identity()
     image = posed.render_image(model, view, here, Sampling(), progress=lambda *done: told.append(done))
     assert image.color.shape == image.normal.shape == (24, 24, 3)
-    _, fine = render_view(scene, camera, samples=5)
+    _, fine = render_view(SCENES["painted-sphere"](), camera, samples=5)
     inner, outer = fine == 1, fine == 0  # without the pixels that the outline crosses
     assert inner.sum() > 100
     assert outer.sum() > 50
@@ -200,12 +198,11 @@ def share_seen(views: list[posed.SeenFrom]) -> tuple[float, np.ndarray]:
 def test_two_cameras_side_by_side_see_a_cap() -> None:
     """From distance d a sphere is seen where its normal is within acos(r / d) of the eye, (1 − r / d) / 2 of it."""
     share, points = share_seen([photograph((x, 0.0, DISTANCE)) for x in (0.02, -0.02)])
-    cap = (1 - RADIUS / DISTANCE) / 2
     # The rim: two pixels' width, of 40° / 120 at 1.5 to 2, and as much again by which the points end before it, and the
     # places in which views are counted; of a circle around a sphere, in units of its area.
     pixel = 2 * 2 * math.tan(math.radians(20)) / 120 * DISTANCE
     rim = 2 * math.pi * RADIUS * (pixel + 1 / 32) / (4 * math.pi * RADIUS**2)
-    assert share == pytest.approx(cap, abs=rim)
+    assert share == pytest.approx((1 - RADIUS / DISTANCE) / 2, abs=rim)
     assert (points[:, 2] > RADIUS * RADIUS / DISTANCE - 1 / 32).all()
 
 

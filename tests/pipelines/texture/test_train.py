@@ -119,14 +119,6 @@ def test_a_part_outside_the_band_is_left_out_and_counted() -> None:
     assert fit_texture(Sphere(radius=0.5), replace(cloud, points=points), BRIEF).record["left_out"] == 101
 
 
-def test_ctrl_c_leaves_what_was_learnt() -> None:
-    config = replace(SMALL, steps=10_000)
-    fitted = fit_texture(Sphere(radius=0.5), sphere_cloud(), config, progress=interrupt("texture", 20))
-    assert not fitted.record["finished"]
-    assert 20 <= fitted.record["steps"] < 10_000
-    assert fitted.texture.value(torch.tensor([[0.5, 0.0, 0.0]])).isfinite().all()
-
-
 def test_a_geometry_in_double_precision_gets_a_texture_in_it() -> None:
     texture = fit_texture(plane_field().double(), plane_cloud(center=0.0), BRIEF).texture
     assert texture.value(torch.zeros(4, 3, dtype=torch.float64)).dtype == torch.float64
