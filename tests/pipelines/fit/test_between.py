@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import torch
 from fits import SMALL
-from mplicits.datasets import PointCloud
-from mplicits.datasets.synthetic.samples import sample_sphere, sample_torus
+from mplicits.datasets import PointCloud, sample_sphere, sample_torus
 from mplicits.neural_fields import Torus
-from mplicits.pipelines.fit import between
+from mplicits.pipelines.fit import between, fit
 from mplicits.pipelines.fit.between import BETWEEN, Densified, dense_distance, densified
 from mplicits.pipelines.fit.cloud import CloudDistance
-from mplicits.pipelines.fit.train import fit
 from scipy.spatial import KDTree
 
 

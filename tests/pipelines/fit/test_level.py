@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 from fits import SMALL
-from mplicits.datasets import PointCloud
-from mplicits.datasets.synthetic.samples import sample_sphere
+from mplicits.datasets import PointCloud, sample_sphere
 from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.fit import describe
 from mplicits.pipelines.fit.level import JUDGE, Error, Fall, Judge, LevelObjective, Verdict, held_out, standard_errors

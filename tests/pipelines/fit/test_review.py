@@ -8,14 +8,12 @@ import pytest
 import torch
 from fits import SMALL
 from mplicits.datasets import OrientedCloud, PointCloud, add_outliers, sample_sphere, sample_torus
-from mplicits.neural_fields import InputError, MultiscaleSDF, Plane, Siren, Sphere, Torus
-from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
+from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Plane, Siren, Sphere, Torus, extract_mesh
+from mplicits.pipelines.fit import FitConfig, fit, prepare
 from mplicits.pipelines.fit.review import review_points
-from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.surface.surface import read_support
 from mplicits.pipelines.training.folder import SUPPORT_FILE, read_record
-from mplicits.pipelines.training.settings import FitConfig
 
 CPU = torch.device("cpu")
 

@@ -11,15 +11,12 @@ import pytest
 import torch
 from fits import SMALL, assert_same, interrupt
 from mplicits.datasets import PointCloud
-from mplicits.neural_fields import InputError, load_field
-from mplicits.neural_fields.meshing.extract import extract_mesh
+from mplicits.neural_fields import InputError, extract_mesh, load_field
 from mplicits.pipelines.cli.fit import describe
+from mplicits.pipelines.fit import FitConfig, Interrupted, fit
 from mplicits.pipelines.fit.level import JUDGE, LEVEL, calm_omega
-from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.folder import read_record
 from mplicits.pipelines.training.machine import choose_device
-from mplicits.pipelines.training.settings import FitConfig
-from mplicits.pipelines.training.trainer import Interrupted
 
 # A budget of seconds has no room for its second level.
 LONG = FitConfig(

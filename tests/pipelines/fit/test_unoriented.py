@@ -9,11 +9,9 @@ import pytest
 import torch
 from mplicits.datasets import OrientedCloud, PointCloud, prepare_cloud, sample_sphere, sample_torus
 from mplicits.neural_fields import load_field
+from mplicits.pipelines.fit import FitConfig, Interrupted, fit, prepare
 from mplicits.pipelines.fit.cloud import CloudDistance
-from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.fit.unoriented import SIGNING, STAGES, Places, Signs, fits_better, give_signs
-from mplicits.pipelines.training.settings import FitConfig
-from mplicits.pipelines.training.trainer import Interrupted
 from torch import Tensor
 
 SMALL = replace(fits.SMALL, omegas=(20.0, 20.0), steps=(100, 30), normals="none")

@@ -7,8 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets.synthetic.scenes import SCENES, render_scene
-from mplicits.datasets.views.images import PosedImages
+from mplicits.datasets import SCENES, PosedImages, render_scene
 from mplicits.neural_fields import InputError, Siren
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model

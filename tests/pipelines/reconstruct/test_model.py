@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import look_at
-from mplicits.datasets.views.images import PosedImage
+from mplicits.datasets import PosedImage, look_at
 from mplicits.neural_fields import InputError, Similarity, Sphere, ViewColor
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.neural_fields.volume.weights import sphere_span

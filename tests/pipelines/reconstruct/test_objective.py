@@ -7,9 +7,8 @@ from functools import partial
 import pytest
 import torch
 from mplicits.datasets.views.images import PosedImage, PosedImages
-from mplicits.neural_fields import Similarity
+from mplicits.neural_fields import Similarity, fit_sphere
 from mplicits.neural_fields.fields.losses import eikonal_loss
-from mplicits.neural_fields.networks.sphere_init import fit_sphere
 from mplicits.neural_fields.volume.weights import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths

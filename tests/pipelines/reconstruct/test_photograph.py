@@ -7,8 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets.views.images import PosedImages
-from mplicits.datasets.views.writing import write_transforms
+from mplicits.datasets import PosedImages, write_transforms
 from mplicits.neural_fields import InputError, Similarity, Sphere, save_field
 from mplicits.neural_fields.networks.value_grid import ValueGrid
 from mplicits.neural_fields.volume.render import Sampling

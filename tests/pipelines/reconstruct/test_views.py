@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from mplicits.datasets import look_at
+from mplicits.datasets import SCENES, PosedImage, look_at, write_transforms
 from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
-from mplicits.datasets.synthetic.scenes import SCENES, render_view
-from mplicits.datasets.views.images import PosedImage
-from mplicits.datasets.views.writing import write_transforms
+from mplicits.datasets.synthetic.scenes import render_view
 from mplicits.neural_fields import Mesh, Similarity, Sphere, Union, extract_mesh, save_field
 from mplicits.neural_fields.networks.value_grid import ValueGrid
 from mplicits.neural_fields.volume.render import Sampling
