@@ -12,11 +12,11 @@ import torch
 from fits import SMALL, assert_same, interrupt
 from mplicits.datasets import PointCloud
 from mplicits.neural_fields import InputError, extract_mesh, load_field
+from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.pipelines.cli.fit import describe
 from mplicits.pipelines.fit import FitConfig, Interrupted, fit
 from mplicits.pipelines.fit.level import JUDGE, LEVEL, calm_omega
 from mplicits.pipelines.training.folder import read_record
-from mplicits.pipelines.training.machine import choose_device
 
 # A budget of seconds has no room for its second level.
 LONG = FitConfig(

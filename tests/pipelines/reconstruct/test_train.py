@@ -19,7 +19,7 @@ from mplicits.datasets.views.writing import write_neus, write_transforms
 from mplicits.neural_fields import InputError, Similarity, Sphere, ViewColor, extract_mesh, load_field, load_texture
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.reconstruct import silhouettes
+from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct.model import SceneModel
 from mplicits.pipelines.reconstruct.train import reconstruct, surface_colors
 from mplicits.pipelines.surface.measure import chamfer
@@ -257,8 +257,8 @@ def test_a_contradicted_picture_is_left_out(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_what_is_behind_holes_of_masks_is_not_learnt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    limits = silhouettes.Limits(few=4)
-    monkeypatch.setattr(silhouettes, "Limits", lambda: limits)
+    limits = hull.Limits(few=4)
+    monkeypatch.setattr(hull, "Limits", lambda: limits)
     torn = with_fault(painted_sphere(6, 24), "holes")
     write_neus(tmp_path / "torn", torn)
     assert main(f"reconstruct {tmp_path / 'torn'} -o {tmp_path / 'run'} {FLAGS} --texture-steps 0".split()) == 0

@@ -13,7 +13,7 @@ from mplicits.datasets import SCENES, PosedImage, look_at, write_transforms
 from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
 from mplicits.datasets.synthetic.scenes import render_view
 from mplicits.neural_fields import Mesh, Similarity, Sphere, Union, extract_mesh, save_field
-from mplicits.neural_fields.networks.value_grid import ValueGrid
+from mplicits.neural_fields.networks.grids import ValueGrid
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct import views as posed
