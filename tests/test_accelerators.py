@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import mplicits.neural_fields as nf
 import numpy as np
 import pytest
 import standin
@@ -22,20 +23,6 @@ from mplicits.datasets.cameras import look_at
 from mplicits.datasets.clouds.cleaning.prepare import prepare_cloud
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_neus
-from mplicits.neural_fields import (
-    InstantNSRGeometry,
-    NerfstudioField,
-    NeuSGeometry,
-    Similarity,
-    Siren,
-    Sphere,
-    Torus,
-    WorldField,
-    extract_mesh,
-    load_field,
-    render_volume,
-    sphere_trace,
-)
 from mplicits.neural_fields.networks.radiance import ViewColor
 from mplicits.neural_fields.networks.sphere_init import fit_sphere, solve_sphere
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
@@ -96,9 +83,9 @@ def traced(device: torch.device) -> Result:
     field, (origin, directions) = small_multiscale(0.3).to(device), rays(device)
     near = cone_starts(field, origin, directions, tiles=(8, 4))
     far = cone_ends(field, origin, directions, near.isfinite(), tiles=(8, 4))
-    hits = sphere_trace(field, origin, directions, near=near, far=far, max_steps=64)
-    fixed = sphere_trace(field, origin, directions, budget=(20, 5, 5))
-    graph = sphere_trace(field, origin, directions, max_steps=64, differentiable=True)
+    hits = nf.sphere_trace(field, origin, directions, near=near, far=far, max_steps=64)
+    fixed = nf.sphere_trace(field, origin, directions, budget=(20, 5, 5))
+    graph = nf.sphere_trace(field, origin, directions, max_steps=64, differentiable=True)
     graph.depth[graph.mask].sum().backward()
     return near, far, *hits, *fixed, *(parameter.grad for parameter in field.base.parameters())
 
@@ -110,8 +97,8 @@ def traced_in_time(device: torch.device) -> Result:
 
 
 def meshed(device: torch.device) -> Result:
-    mesh = extract_mesh(Sphere(radius=0.6).to(device), resolution=24)
-    fine = extract_mesh(two_levels().to(device), resolution=24)
+    mesh = nf.extract_mesh(nf.Sphere(radius=0.6).to(device), resolution=24)
+    fine = nf.extract_mesh(two_levels().to(device), resolution=24)
     return mesh.vertices, mesh.faces, mesh.normals, fine.vertices, fine.normals
 
 
@@ -125,7 +112,7 @@ def volume_rendered(device: torch.device) -> Result:
     directions = directions.reshape(-1, 3)
     found = []
     for generator in (None, torch.Generator().manual_seed(0)):
-        seen = render_volume(
+        seen = nf.render_volume(
             field,
             color,
             origin.expand_as(directions),
@@ -141,7 +128,7 @@ def volume_rendered(device: torch.device) -> Result:
 
 
 def in_neus(device: torch.device) -> Result:
-    host = NeuSHost(NeuSGeometry(small_multiscale(0.5)), 2)
+    host = NeuSHost(nf.NeuSGeometry(small_multiscale(0.5)), 2)
     host.geometry.to(device)
     host.color.to(device)
     host.inverse_deviation = nn.Parameter(host.inverse_deviation.detach().to(device))
@@ -159,7 +146,7 @@ def in_neus(device: torch.device) -> Result:
 
 
 def in_instant_nsr(device: torch.device) -> Result:
-    geometry = InstantNSRGeometry(small_multiscale(0.5), radius=1.5).to(device)
+    geometry = nf.InstantNSRGeometry(small_multiscale(0.5), radius=1.5).to(device)
     x = (torch.rand(20, 3) - 0.5).to(device)
     found = geometry(x, with_grad=True, with_feature=True)
     sum(part.square().mean() for part in found).backward()
@@ -167,7 +154,7 @@ def in_instant_nsr(device: torch.device) -> Result:
 
 
 def in_nerfstudio(device: torch.device) -> Result:
-    host = NerfstudioField(small_multiscale(0.5), ViewColor(2, width=16, depth=1), heads=Heads).to(device)
+    host = nf.NerfstudioField(small_multiscale(0.5), ViewColor(2, width=16, depth=1), heads=Heads).to(device)
     samples = ray_samples(torch.linspace(0.2, 1.8, 8).expand(6, 8))
     for name in ("origins", "directions", "starts"):
         setattr(samples.frustums, name, getattr(samples.frustums, name).to(device))
@@ -179,7 +166,7 @@ def in_nerfstudio(device: torch.device) -> Result:
 
 def in_input_units(device: torch.device) -> Result:
     """Arrays in, arrays out, wherever the field is."""
-    world = WorldField(small_multiscale(0.3).to(device), Similarity((5.0, 0.0, -1.0), 20.0))
+    world = nf.WorldField(small_multiscale(0.3).to(device), nf.Similarity((5.0, 0.0, -1.0), 20.0))
     points = np.random.default_rng(0).uniform(-20, 20, (40, 3))
     hits = world.trace(points, -points)
     closest = world.closest(points)
@@ -187,7 +174,7 @@ def in_input_units(device: torch.device) -> Result:
 
 
 def begun_as_spheres(device: torch.device) -> Result:
-    solved, trained = Siren(32, 2, omega=10.0).to(device), Siren(32, 2, omega=10.0).to(device)
+    solved, trained = nf.Siren(32, 2, omega=10.0).to(device), nf.Siren(32, 2, omega=10.0).to(device)
     solve_sphere(solved)
     fit_sphere(trained, steps=3, batch=64)
     return *tensors(solved), *tensors(trained)
@@ -276,12 +263,14 @@ def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest
         write_cloud_ply(
             Path("coloured.ply"), PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype(np.float32))
         )
-        write_mesh(Path("mesh.ply"), extract_mesh(Torus(major=0.5, minor=0.2), resolution=16), Similarity.identity())
+        write_mesh(
+            Path("mesh.ply"), nf.extract_mesh(nf.Torus(major=0.5, minor=0.2), resolution=16), nf.Similarity.identity()
+        )
         write_neus(Path("photos"), scene)
         for command in COMMANDS:
             run = benchmarks if command.startswith("normal-map") else main
             assert run([*command.split(), "--device", str(device)]) == 0, command
-        found = [tensor for name in FIELDS for tensor in tensors(load_field(f"{name}/field.safetensors").field)]
+        found = [tensor for name in FIELDS for tensor in tensors(nf.load_field(f"{name}/field.safetensors").field)]
         return [*found, *(cv2.imread(name, cv2.IMREAD_UNCHANGED) for name in PICTURES)]
 
     same(work, accelerator)

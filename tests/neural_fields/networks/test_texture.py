@@ -4,15 +4,7 @@ import pytest
 import torch
 from bounds import assert_within, rounding
 from fields import Watched
-from mplicits.neural_fields import (
-    Field,
-    Jet,
-    MultiscaleSDF,
-    Siren,
-    Sphere,
-    TextureField,
-    Torus,
-)
+from mplicits.neural_fields import Field, Jet, MultiscaleSDF, Siren, Sphere, TextureField, Torus
 from mplicits.neural_fields.fields.losses import color_loss, tangential_loss
 from mplicits.neural_fields.networks.texture import ColorSiren
 from torch import Tensor

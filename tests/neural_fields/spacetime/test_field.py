@@ -2,28 +2,15 @@
 
 import math
 
+import mplicits.neural_fields as nf
 import pytest
 import torch
 from bounds import assert_within, rounding, unit_roundoff
 from fields import FIELDS, SCREW, small_multiscale, small_spacetime
-from mplicits.neural_fields import (
-    Box,
-    Field,
-    Moving,
-    MultiscaleSDF,
-    Plane,
-    RigidMotion,
-    Siren,
-    SpaceTimeSDF,
-    Sphere,
-    TimeSlice,
-    Torus,
-    at_time,
-)
 from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from torch import Tensor
 
-TRAVEL = RigidMotion(velocity=(0.4, 0.2, 0.0), center=(-0.2, 0.0, 0.1), angle=2.0)
+TRAVEL = nf.RigidMotion(velocity=(0.4, 0.2, 0.0), center=(-0.2, 0.0, 0.1), angle=2.0)
 
 
 def box_points(count: int, dim: int = 3) -> Tensor:
@@ -37,8 +24,8 @@ def box_points(count: int, dim: int = 3) -> Tensor:
 def test_a_slice_is_the_field_at_its_time(name: str) -> None:
     field = FIELDS[name]().double()
     x = box_points(500)
-    whole = at_time(x, 0.3)
-    part = TimeSlice(field, 0.3)
+    whole = nf.at_time(x, 0.3)
+    part = nf.TimeSlice(field, 0.3)
     for level in range(field.num_levels):
         jet, expected = part.jet(x, level=level), field.jet(whole, level=level)
         assert torch.equal(part.value(x, level=level), field.value(whole, level=level))
@@ -55,7 +42,7 @@ def test_a_slice_is_the_field_at_its_time(name: str) -> None:
 def test_a_slice_follows_its_field_and_passes_gradients_to_the_time() -> None:
     field = small_spacetime(0.4).double()
     x, t = box_points(50), torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
-    part = TimeSlice(field, t)
+    part = nf.TimeSlice(field, t)
     part.value(x).sum().backward()
     assert t.grad is not None
     torch.testing.assert_close(t.grad, part.time_derivative(x).sum())
@@ -72,10 +59,10 @@ def test_the_time_folds_into_the_biases(taper: float, dtype: torch.dtype) -> Non
     state = torch.random.get_rng_state()
     frozen = field.at(0.37)
     assert torch.equal(torch.random.get_rng_state(), state)
-    assert isinstance(frozen.base, Siren)
+    assert isinstance(frozen.base, nf.Siren)
     assert frozen.base.in_dim == 3
     assert not any(p.requires_grad for p in frozen.parameters())
-    part = TimeSlice(field, 0.37)
+    part = nf.TimeSlice(field, 0.37)
     keep = torch.ones(len(x), dtype=torch.bool)
     for level in range(3):  # rounding may put a point on either side of a hard gate
         keep &= frozen.in_band(x, level=level) == part.in_band(x, level=level)
@@ -88,10 +75,10 @@ def test_the_time_folds_into_the_biases(taper: float, dtype: torch.dtype) -> Non
 
 
 def test_levels_that_are_no_sirens_are_sliced_too() -> None:
-    sdf = MultiscaleSDF(Moving(Sphere(), TRAVEL), [Siren(16, 1, omega=5.0, in_dim=4)], [0.2])
-    part, x = TimeSlice(SpaceTimeSDF(sdf).double(), 0.8), box_points(300)
+    sdf = nf.MultiscaleSDF(nf.Moving(nf.Sphere(), TRAVEL), [nf.Siren(16, 1, omega=5.0, in_dim=4)], [0.2])
+    part, x = nf.TimeSlice(nf.SpaceTimeSDF(sdf).double(), 0.8), box_points(300)
     off = rounding(part, x, lambda field, x: [field.value(x)])[0]
-    assert_within(SpaceTimeSDF(sdf).at(0.8).value(x), part.value(x), 2 * off)
+    assert_within(nf.SpaceTimeSDF(sdf).at(0.8).value(x), part.value(x), 2 * off)
 
 
 # Embedding
@@ -101,12 +88,12 @@ def test_levels_that_are_no_sirens_are_sliced_too() -> None:
 @pytest.mark.parametrize("taper", [0.0, 0.4])
 def test_a_static_field_is_embedded_exactly(extra: int, taper: float) -> None:
     static = small_multiscale(taper).double().requires_grad_(False)
-    field = SpaceTimeSDF.from_static(static, extra_width=extra)
+    field = nf.SpaceTimeSDF.from_static(static, extra_width=extra)
     assert torch.equal(field.deltas, static.deltas)
     x = box_points(1000)
     for t in (0.0, 0.4, 1.0):
         for level in range(3):
-            jet, expected = field.jet(at_time(x, t), level=level), static.jet(x, level=level)
+            jet, expected = field.jet(nf.at_time(x, t), level=level), static.jet(x, level=level)
             off = rounding(static, x, lambda field, x, level=level: field.jet(x, level=level))
             for ours, theirs, bound in zip(jet, expected, off, strict=True):
                 assert_within(ours[..., : theirs.shape[-1]], theirs, 2 * bound)
@@ -114,7 +101,7 @@ def test_a_static_field_is_embedded_exactly(extra: int, taper: float) -> None:
 
 
 def test_an_embedded_field_starts_to_move_at_once() -> None:
-    field = SpaceTimeSDF.from_static(Siren(16, 2, omega=5.0), extra_width=8)
+    field = nf.SpaceTimeSDF.from_static(nf.Siren(16, 2, omega=5.0), extra_width=8)
     field.value(torch.rand(100, 4)).square().sum().backward()
     for layer in [*field.sdf.base.layers, field.sdf.base.output]:  # pyright: ignore
         assert bool((layer.weight.grad != 0).any(dim=1).all() or layer.out_features == 24)
@@ -128,7 +115,7 @@ def test_an_embedded_field_starts_to_move_at_once() -> None:
 
 
 def test_a_quarter_turn_and_a_step() -> None:
-    motion = RigidMotion(axis=(0, 0, 2), angle=math.pi / 2, center=(1.0, 0.0, 0.0), velocity=(0.0, 0.0, 3.0))
+    motion = nf.RigidMotion(axis=(0, 0, 2), angle=math.pi / 2, center=(1.0, 0.0, 0.0), velocity=(0.0, 0.0, 3.0))
     x = torch.tensor([[2.0, 0.0, 0.5]], dtype=torch.float64)
     torch.testing.assert_close(motion.forward(x, 1.0), torch.tensor([[1.0, 1.0, 3.5]], dtype=torch.float64))
     torch.testing.assert_close(motion.inverse(motion.forward(x, 0.7), 0.7), x)
@@ -142,9 +129,9 @@ def test_the_velocity_of_a_motion_is_its_derivative() -> None:
 
 
 def test_a_moving_field_keeps_its_values() -> None:
-    static = Torus(major=0.5, minor=0.2)
+    static = nf.Torus(major=0.5, minor=0.2)
     x, t = box_points(500), torch.rand(500, dtype=torch.float64)
-    torch.testing.assert_close(Moving(static, SCREW).value(at_time(SCREW.forward(x, t), t)), static.value(x))
+    torch.testing.assert_close(nf.Moving(static, SCREW).value(nf.at_time(SCREW.forward(x, t), t)), static.value(x))
 
 
 def test_both_shrinking_spheres_have_the_radius_of_the_formula() -> None:
@@ -154,29 +141,29 @@ def test_both_shrinking_spheres_have_the_radius_of_the_formula() -> None:
     for exact_law in (False, True):
         field = ShrinkingSphere(radius=0.8, alpha=0.12, exact_law=exact_law)
         # Lengths, roots and their difference, of numbers below 1.
-        assert float(field.value(at_time(surface, t)).abs().max()) < 16 * unit_roundoff(torch.float64)
-        assert torch.equal(field.value(at_time(surface, 0.0)), surface.norm(dim=-1) - 0.8) or exact_law
+        assert float(field.value(nf.at_time(surface, t)).abs().max()) < 16 * unit_roundoff(torch.float64)
+        assert torch.equal(field.value(nf.at_time(surface, 0.0)), surface.norm(dim=-1) - 0.8) or exact_law
 
 
 def test_keyframes_meet_their_keys_and_blend_in_between() -> None:
-    keys: list[Field] = [Sphere(radius=0.3), Box(), Torus()]
+    keys: list[nf.Field] = [nf.Sphere(radius=0.3), nf.Box(), nf.Torus()]
     frames = Keyframes([0.0, 0.25, 1.0], keys)
     x = box_points(300)
     for time, key in zip(frames.times, keys, strict=True):
-        assert torch.equal(frames.value(at_time(x, time)), key.value(x))
-    third = frames.jet(at_time(x, 0.5))
+        assert torch.equal(frames.value(nf.at_time(x, time)), key.value(x))
+    third = frames.jet(nf.at_time(x, 0.5))
     torch.testing.assert_close(third.value, (2 * keys[1].value(x) + keys[2].value(x)) / 3)
     torch.testing.assert_close(third.gradient[:, 3], (keys[2].value(x) - keys[1].value(x)) / 0.75)
-    outside = frames.jet(at_time(x, 1.5))
+    outside = frames.jet(nf.at_time(x, 1.5))
     torch.testing.assert_close(outside.value, keys[2].value(x))
     assert not bool(outside.gradient[:, 3].any())
-    assert torch.equal(frames.jet(at_time(x, 0.0)).gradient[:, 3], (keys[1].value(x) - keys[0].value(x)) / 0.25)
+    assert torch.equal(frames.jet(nf.at_time(x, 0.0)).gradient[:, 3], (keys[1].value(x) - keys[0].value(x)) / 0.25)
 
 
 # Second derivatives
 
 
-def autograd_hessian(field: Field, x: Tensor, level: int) -> Tensor:
+def autograd_hessian(field: nf.Field, x: Tensor, level: int) -> Tensor:
     x = x.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(field.value(x, level=level).sum(), x, create_graph=True)
     columns = [torch.autograd.grad(gradient[:, k].sum(), x, retain_graph=True)[0] for k in range(field.in_dim)]
@@ -184,9 +171,9 @@ def autograd_hessian(field: Field, x: Tensor, level: int) -> Tensor:
 
 
 SIRENS = {
-    "one layer": lambda: Siren(12, 1, omega=4.0),
-    "two layers": lambda: Siren(12, 2, omega=4.0, num_features=2),
-    "four layers": lambda: Siren(10, 4, omega=4.0, in_dim=4),
+    "one layer": lambda: nf.Siren(12, 1, omega=4.0),
+    "two layers": lambda: nf.Siren(12, 2, omega=4.0, num_features=2),
+    "four layers": lambda: nf.Siren(10, 4, omega=4.0, in_dim=4),
 }
 
 
@@ -210,14 +197,14 @@ def test_hessian_of_a_multiscale_field(name: str) -> None:
     field = FIELDS[name]().double()
     x = box_points(400, field.in_dim)
     for level in range(field.num_levels):
-        ours, expected = field.second_jet(x, level=level), Field.second_jet(field, x, level=level)
+        ours, expected = field.second_jet(x, level=level), nf.Field.second_jet(field, x, level=level)
         off = rounding(field, x, lambda field, x, level=level: field.second_jet(x, level=level))
         for a, b, bound in zip(ours, expected, off, strict=True):
             assert_within(a, b, 2 * bound)
 
 
 def test_derivatives_of_the_hessian() -> None:
-    network = Siren(5, 2, omega=3.0).double()
+    network = nf.Siren(5, 2, omega=3.0).double()
     x = box_points(3).requires_grad_()
     assert torch.autograd.gradcheck(lambda x, *_: network.second_jet(x).hessian, (x, *network.parameters()))
 
@@ -227,13 +214,13 @@ def test_hessians_of_closed_forms() -> None:
     length = x.norm(dim=-1)
     normal = x / length[:, None]
     expected = (torch.eye(3, dtype=x.dtype) - normal[:, :, None] * normal[:, None, :]) / length[:, None, None]
-    torch.testing.assert_close(Sphere().second_jet(x).hessian, expected)
-    assert not Sphere().second_jet(x).hessian.requires_grad
-    assert Sphere().second_jet(x.clone().requires_grad_()).hessian.requires_grad
+    torch.testing.assert_close(nf.Sphere().second_jet(x).hessian, expected)
+    assert not nf.Sphere().second_jet(x).hessian.requires_grad
+    assert nf.Sphere().second_jet(x.clone().requires_grad_()).hessian.requires_grad
     with torch.inference_mode():
-        torch.testing.assert_close(Sphere().second_jet(x).hessian, expected)
-    assert float(Plane().second_jet(x).hessian.abs().max()) == 0
-    sliced = TimeSlice(Moving(Sphere(), TRAVEL), 0.5).second_jet(TRAVEL.forward(x, 0.5)).hessian
+        torch.testing.assert_close(nf.Sphere().second_jet(x).hessian, expected)
+    assert float(nf.Plane().second_jet(x).hessian.abs().max()) == 0
+    sliced = nf.TimeSlice(nf.Moving(nf.Sphere(), TRAVEL), 0.5).second_jet(TRAVEL.forward(x, 0.5)).hessian
     torch.testing.assert_close(sliced.diagonal(dim1=1, dim2=2).sum(dim=1), 2 / length)
 
 
@@ -247,7 +234,7 @@ def test_second_jets_follow_the_shape_of_the_input(shape: tuple[int, ...]) -> No
 
 
 def test_blocks_do_not_change_the_hessian(monkeypatch: pytest.MonkeyPatch) -> None:
-    network, x = Siren(32, 3).double().requires_grad_(False), box_points(1000)
+    network, x = nf.Siren(32, 3).double().requires_grad_(False), box_points(1000)
     whole = network.second_jet(x).hessian
     monkeypatch.setattr("mplicits.neural_fields.networks.siren.BLOCK_FLOATS", 32 * 256)
     off = rounding(network, x, lambda field, x: [field.second_jet(x).hessian])[0]

@@ -10,14 +10,7 @@ from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
 from mplicits.neural_fields.fields.field import OneLevelField, as_field
 from mplicits.neural_fields.networks.radiance import Outside
 from mplicits.neural_fields.networks.value_grid import ValueGrid
-from mplicits.neural_fields.volume.render import (
-    Rendered,
-    Samples,
-    Sampling,
-    render_samples,
-    sample_depths,
-    sample_rays,
-)
+from mplicits.neural_fields.volume.render import Rendered, Samples, Sampling, render_samples, sample_depths, sample_rays
 from mplicits.neural_fields.volume.weights import sphere_span
 from torch import Tensor
 
@@ -326,10 +319,7 @@ class TestSkipping:
         light = counts[counts != 1]
         # Each is 4 with a probability of 1/4, so of n the mean is 1 with a variance of 3/n.
         assert abs(float(light.mean()) - 1) < 5 * (3 / len(light)) ** 0.5
-        assert {*self.seen(alpha_threshold=1e-3, skip_share=0.25).counts.unique().tolist()} == {
-            0.0,
-            1.0,
-        }
+        assert {*self.seen(alpha_threshold=1e-3, skip_share=0.25).counts.unique().tolist()} == {0.0, 1.0}
 
     def test_rays_that_miss_keep_where_they_come_nearest(self) -> None:
         field, origins = Sphere(radius=0.5), torch.tensor([[0.0, 0.7, 2.0], [0.0, 0.9, 2.0]])
