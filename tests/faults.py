@@ -1,8 +1,6 @@
-"""A disk that fails, or a process that is killed, at a chosen one of the operations that change a disk for good.
+"""A disk that fails, or a process that is killed, at a chosen operation of `neural_fields.backend.files`.
 
-Every such operation of the package goes through `neural_fields.backend.files`. `Faults` counts them, and at one of them
-
-- "killed": nothing of it happens, nor of any that would follow: no clean-up, as after SIGKILL or a power cut;
+- "killed": that operation and all after it do not happen, as after SIGKILL or a power cut;
 - "torn": half of it happens, if it is a write, and nothing after it;
 - "full": it raises that the disk is full, once; what follows works.
 """

@@ -17,6 +17,11 @@ from benchmarks.motion.figures import DeformingField, Twisting
 from benchmarks.peers import BaconSDF, BandLimited, BanfSDF, HashGridSDF
 
 
+def cube(*shape: int, dim: int = 3, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Random points of the cube [−1, 1]ᵈ, ``(*shape, d)``."""
+    return 2 * torch.rand(*shape, dim, dtype=dtype) - 1
+
+
 def small_multiscale(taper: float = 0.0) -> nf.MultiscaleSDF:
     """Three untrained levels whose bands cut the unit cube into parts of comparable size."""
     return nf.MultiscaleSDF.from_widths(
@@ -52,7 +57,7 @@ def small_encoded() -> EncodedField:
 
 
 class Watched(nf.Field):
-    """A field that remembers at which points it was asked, for values or for jets."""
+    """A field that records the points of its evaluations, of values and of jets."""
 
     def __init__(self, inner: nf.Field) -> None:
         super().__init__()
@@ -75,8 +80,7 @@ class Watched(nf.Field):
 
     def counts(self) -> tuple[int, int]:
         """How many points so far, for values and for jets."""
-        values, jets = (sum(x.shape[:-1].numel() for x in asked) for asked in (self.values, self.jets))
-        return values, jets
+        return sum(x[..., 0].numel() for x in self.values), sum(x[..., 0].numel() for x in self.jets)
 
 
 class Scaled(nf.Field):
@@ -146,6 +150,5 @@ FIELDS: dict[str, Callable[[], nf.Field]] = {
         VelocitySiren(16, 2, gain=0.5),
     ),
 }
-EXACT = {
-    name: FIELDS[name] for name in ("sphere", "plane", "torus", "box", "capsule", "slice-of-moving")
-}  # signed distances everywhere, not only signs
+# Signed distances everywhere, not only signs.
+EXACT = {name: FIELDS[name] for name in ("sphere", "plane", "torus", "box", "capsule", "slice-of-moving")}

@@ -1,7 +1,4 @@
-"""The part of nerfstudio that our methods touch, in small, so that they can be tried where it is not installed.
-
-Configurations keep what they are given; the model asks its field what nerfstudio's asks it in a step.
-"""
+"""The part of nerfstudio that our methods use, so that they can be tested where it is not installed."""
 
 import enum
 import sys

@@ -1,8 +1,6 @@
-"""A notebook from a script in the percent format: ``# %%`` begins a cell, ``# %% [markdown]`` one of words.
+"""A notebook from a script in the percent format, written beside it: ``python tests/notebook.py SCRIPT.py``.
 
-    python tests/notebook.py docs/tutorials/what_a_field_answers.py
-
-writes the .ipynb beside the script. Jupyter is not needed, neither to write it nor to run its cells.
+``# %%`` begins a cell, ``# %% [markdown]`` one of words. Jupyter is not needed.
 """
 
 import json

@@ -1,7 +1,6 @@
 """What a page draws against the tracer of this package: ``python tests/page_accuracy.py RUN [RUN …]``.
 
-Each run is written as a page, drawn by a headless Chromium in software at the page's own precision, and traced with the
-same rounded weights to 2·10⁻⁵. Then follows what a picture of each level costs.
+Each run is drawn by a headless Chromium and traced with the same rounded weights; then follow the costs of each level.
 """
 
 import argparse

@@ -1,8 +1,6 @@
-"""Everything that evaluates or trains, on an accelerator: the same calls on the CPU and there.
+"""Everything that evaluates or trains gives on an accelerator what it gives on the CPU.
 
-Random numbers come from generators of the host, whatever the device, and the stand-in computes with the CPU's kernels:
-there results are equal to the last bit. On CUDA itself, which rounds otherwise, this asks for finite results of the
-same shape; how good they are is asked elsewhere.
+Equal to the last bit on the stand-in; on CUDA, which rounds otherwise, finite results of the same shape.
 """
 
 from collections.abc import Callable, Sequence
@@ -63,7 +61,7 @@ def same(work: Callable[[torch.device], Result], accelerator: torch.device) -> N
 
 @pytest.fixture(autouse=True)
 def _one_march(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rays march on the CPU too as they do on accelerators; test_ahead.py compares the two marches."""
+    """Rays march on the CPU as on accelerators; test_march_gpu.py compares the two marches."""
     monkeypatch.setattr("mplicits.neural_fields.tracing.sphere.makes_wait", lambda _: True)
 
 
@@ -225,7 +223,6 @@ def test_signs_of_normals(accelerator: torch.device, monkeypatch: pytest.MonkeyP
 
     def work(device: torch.device) -> Result:
         signs = give_signs(points, normals, config, device=device)
-        assert signs is not None
         return signs.turned, np.array(signs.slope)
 
     same(work, accelerator)

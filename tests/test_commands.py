@@ -1,9 +1,6 @@
 """Every command that a reader may copy runs: in the order of its page, in an empty folder, at the smallest setting.
 
-The rule: a page's shell blocks are gone through line by line. What a line reads and no line before it has made is put
-there by a stand-in of that name (`STAND_INS`). What `SMALLEST` has for it is appended to the line, where the last of
-two flags counts, and `SMALLER` replaces the values of flags that not every line may have. A line that cannot run
-here is skipped, visibly, with its reason.
+Files that a line reads are made by `STAND_INS`; `SMALLEST` adds flags to a line, `SMALLER` replaces values of flags.
 """
 
 import dataclasses
@@ -115,7 +112,6 @@ def a_cloud(path: Path) -> None:
 
 def arrays(path: Path) -> None:
     cloud = sample_torus(400)
-    assert cloud.normals is not None
     np.savez(path, points=cloud.points, normals=cloud.normals)
 
 
@@ -141,7 +137,6 @@ def scans_with_truth(path: Path) -> None:
     for folder in ("scans", "ground_truth"):
         (path / folder).mkdir(parents=True)
         cloud = sample_torus(400)
-        assert cloud.normals is not None
         np.save(path / folder / "anchor.npy", np.concatenate((cloud.points, cloud.normals), axis=1))
 
 
@@ -270,11 +265,8 @@ def reason_to_skip(line: str) -> str | None:
         if line.startswith(f"{begin} "):
             return reason
     if line.startswith(("mplicits find-cameras ", "mplicits find-points ")) or "--poses colmap" in line:
-        return (
-            "COLMAP finds nothing in pictures so small; tests/datasets/views/poses/test_find_cameras.py has larger ones"
-        )
-    needs = {"poisson": "pymeshlab", "--texture": "xatlas"}
-    for word, module in needs.items():
+        return "COLMAP finds nothing in pictures so small; test_find_cameras.py has larger ones"
+    for word, module in {"poisson": "pymeshlab", "--texture": "xatlas"}.items():
         if word in words and find_spec(module) is None:
             return f"{module} is not installed"
     return None
@@ -296,10 +288,7 @@ LONG = ("animate", "evolve")  # pages whose lines train the most; the tour has t
 
 LINES = [
     pytest.param(
-        page,
-        benches,
-        id=f"{page.stem}{'-bench' if benches else ''}",
-        marks=[pytest.mark.slow] if benches or page.stem in LONG else [],
+        page, benches, id=page.stem + "-bench" * benches, marks=[pytest.mark.slow] * (benches or page.stem in LONG)
     )
     for page in PAGES
     for benches in (False, True)
@@ -308,15 +297,7 @@ LINES = [
 
 
 @pytest.mark.parametrize(("page", "benches"), LINES)
-def test_commands_of_a_page_run(
-    page: Path,
-    benches: bool,
-    stand_in: Maker,
-    subtests: pytest.Subtests,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_commands_of_a_page_run(page, benches, stand_in, subtests, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     Path("few.yaml").write_text(FEW, encoding="utf-8")
     for name, content in files_of(page):
@@ -336,11 +317,8 @@ def test_commands_of_a_page_run(
 
 
 def test_no_command_hides_in_a_block_of_another_kind() -> None:
+    blocks = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
     for page in PAGES:
-        for language, block in re.findall(
-            r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-        ):
-            if language != "sh":
-                assert not re.search(r"^(mplicits|python -m benchmarks) ", block, re.MULTILINE), (
-                    f"{page.name}: call this block sh:\n{block}"
-                )
+        for language, block in blocks.findall(page.read_text(encoding="utf-8")):
+            command = re.search(r"^(mplicits|python -m benchmarks) ", block, re.MULTILINE)
+            assert language == "sh" or not command, f"{page.name}: call this block sh:\n{block}"

@@ -36,9 +36,7 @@ def field(make: Callable[[], Field], dtype: torch.dtype, device: torch.device) -
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (0,), (7,), (2, 3), (3, 0, 2)])
-def test_shapes_and_types_follow_the_input(
-    field: Field, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
-) -> None:
+def test_shapes_and_types_follow_the_input(field, shape, dtype, device) -> None:
     x = points(field, shape, dtype=dtype, device=device)
     for level in range(-field.num_levels, field.num_levels):
         value, jet = field.value(x, level=level), field.jet(x, level=level)
@@ -54,9 +52,7 @@ def test_shapes_and_types_follow_the_input(
             assert tensor.device.type == device.type
 
 
-def test_jet_agrees_with_value_and_autograd(
-    field: Field, make: Callable[[], Field], dtype: torch.dtype, device: torch.device
-) -> None:
+def test_jet_agrees_with_value_and_autograd(field, make, dtype, device) -> None:
     for level in range(field.num_levels):
         x, (off, slope_off, _) = jet_rounding(make, dtype, level)
         x = x.to(device).clone().requires_grad_()
@@ -66,9 +62,7 @@ def test_jet_agrees_with_value_and_autograd(
         assert_within(jet.gradient, gradient, 2 * slope_off)
 
 
-def test_features_without_gradients_are_those_of_the_jet(
-    field: Field, make: Callable[[], Field], dtype: torch.dtype, device: torch.device
-) -> None:
+def test_features_without_gradients_are_those_of_the_jet(field, make, dtype, device) -> None:
     for level in range(field.num_levels):
         x, (off, _, feature_off) = jet_rounding(make, dtype, level)
         x = x.to(device)
@@ -87,9 +81,7 @@ def test_points_can_be_brought_to_a_field(field: Field, dtype: torch.dtype, devi
     assert field.value(half).dtype == dtype
 
 
-def test_results_without_a_graph_are_the_same(
-    field: Field, make: Callable[[], Field], dtype: torch.dtype, device: torch.device
-) -> None:
+def test_results_without_a_graph_are_the_same(field, make, dtype, device) -> None:
     x, off = jet_rounding(make, dtype, field.num_levels - 1)
     x = x.to(device)
     with_graph = field.jet(x.clone().requires_grad_())

@@ -8,9 +8,8 @@ import pytest
 import standin
 import torch
 from fields import small_multiscale
-from mplicits.neural_fields import Siren, Sphere, Torus, sphere_trace
+from mplicits.neural_fields import Siren, Sphere
 from torch import Tensor
-from waits import some_rays
 
 DEVICE = torch.device(standin.NAME)
 
@@ -65,7 +64,6 @@ def test_operands_on_two_devices_are_refused(mixed: object) -> None:
 
 
 def test_numbers_of_the_host_are_taken() -> None:
-    """As CUDA does: they travel with the call."""
     x, two = on_device(3), torch.tensor(2.0)
     for result in (x * two, two * x, torch.where(x > 2, two, x), torch.maximum(x, two), x.masked_fill(x < 2, two)):
         assert result.device.type == standin.NAME
@@ -92,12 +90,10 @@ def test_generators_of_the_host_are_refused() -> None:
 
 def test_memory_that_may_not_be_there_yet_is_refused() -> None:
     x = on_device(3)
-    with pytest.raises(RuntimeError, match="may be read before"):
-        x.to("cpu", non_blocking=True)
-    with pytest.raises(RuntimeError, match="may be read before"):
-        torch.empty(3).copy_(x, non_blocking=True)
-    with pytest.raises(RuntimeError, match="only dense CPU tensors can be pinned"):
-        x.pin_memory()
+    copies = (lambda: x.to("cpu", non_blocking=True), lambda: torch.empty(3).copy_(x, non_blocking=True))
+    for attempt in (*copies, x.pin_memory):
+        with pytest.raises(RuntimeError, match=r"may be read before|only dense CPU tensors can be pinned"):
+            attempt()
 
 
 @pytest.mark.parametrize(
@@ -179,10 +175,9 @@ def test_counts_are_the_same_every_time() -> None:
         with standin.counted() as book:
             field.zero_grad()
             field.jet(x).gradient.square().sum().backward()
-        books.append(book)
-    assert books[0].launches == books[1].launches
-    assert books[0].kernels > 0
-    assert books[0].synchronisations == 0
+        assert (book.kernels > 0, book.synchronisations) == (True, 0)
+        books.append(book.launches)
+    assert books[0] == books[1]
 
 
 def test_modules_and_their_gradients() -> None:
@@ -223,22 +218,13 @@ def test_fields_are_the_cpus_to_the_last_bit(taper: float) -> None:
     x = 2 * torch.rand(300, 3) - 1
     y = x.to(DEVICE)
     assert twin.value(y).cpu().equal(field.value(x))
-    for a, b in zip(twin.second_jet(y), field.second_jet(x), strict=True):
-        assert a.detach().cpu().equal(b.detach())
+    there = [part.cpu() for part in twin.second_jet(y)]
+    torch.testing.assert_close(there, list(field.second_jet(x)), rtol=0, atol=0)
     for place, points in ((field, x), (twin, y)):
         jet = place.jet(points)
         (jet.value.square().sum() + jet.gradient.square().sum()).backward()
     for a, b in zip(twin.parameters(), field.parameters(), strict=True):
         assert a.grad.cpu().equal(b.grad)
-
-
-def test_rays_are_the_cpus_to_the_last_bit() -> None:
-    origins, directions = some_rays(200)
-    for field in (Sphere(radius=0.5), Torus(major=0.5, minor=0.2)):
-        here = sphere_trace(field, origins, directions)
-        there = sphere_trace(copy.deepcopy(field).to(DEVICE), origins.to(DEVICE), directions.to(DEVICE))
-        for a, b in zip(there, here, strict=True):
-            assert a.cpu().equal(b)
 
 
 def test_a_field_that_forgets_its_device_is_caught() -> None:

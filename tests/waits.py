@@ -1,7 +1,6 @@
 """How often an accelerator keeps the host waiting: ``python tests/waits.py``, counted on the stand-in of `standin`.
 
-Each row is a piece of work, counted per pass of the tracer, picture, call or training step. The counts do not depend on
-the machine. With ``--where``, the lines that wait most.
+A row is one workload, per pass, picture, call or training step. With ``--where``, the lines that wait most.
 """
 
 import argparse
@@ -20,7 +19,7 @@ from mplicits.datasets import sample_torus, write_cloud_ply
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_neus
-from mplicits.neural_fields import Field, MultiscaleSDF, Siren, sphere_trace
+from mplicits.neural_fields import Field, MultiscaleSDF, sphere_trace
 from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
 from mplicits.neural_fields.networks.sphere_init import solve_sphere
 from mplicits.pipelines.cli.entry import main as command
@@ -31,22 +30,13 @@ from torch import Tensor
 DEVICE = torch.device(standin.NAME)
 FIT = "--widths 16 16 16 --depths 1 1 1 --omegas 5 10 20 --steps 40 20 20 --learning-rates 1e-2 1e-3 1e-3"
 FIT += " --batch 128 --samples 500 --quiet"
-RECONSTRUCT = (
-    "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --color-grid 8 --steps 20 --rays 16 --uniform 8"
-)
-RECONSTRUCT += " --importance 4 --texture-steps 20 --quiet"
+RECONSTRUCT = "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --color-grid 8 --steps 20 --rays 16"
+RECONSTRUCT += " --uniform 8 --importance 4 --texture-steps 20 --quiet"
 
 
 @dataclass
 class Row:
-    """Counts of one piece of work.
-
-    Attributes:
-        name: of the work.
-        unit: what is counted per.
-        count: how many units there were.
-        ledger: what was counted.
-    """
+    """Counts of one workload, over ``count`` units."""
 
     name: str
     unit: str
@@ -64,7 +54,6 @@ def three_levels() -> MultiscaleSDF:
     field = MultiscaleSDF.from_widths(
         [(128, 2), (256, 2), (400, 2)], omegas=[10, 45, 100], deltas=[0.03, 0.015], residual_gain=0.01
     )
-    assert isinstance(field.base, Siren)
     solve_sphere(field.base)
     return field.requires_grad_(False)
 

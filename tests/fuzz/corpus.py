@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import random
 import struct
@@ -35,20 +34,12 @@ FACES = np.concatenate((QUADS[:, :3], QUADS[:, [0, 2, 3]], [[0, 8, 9], [7, 9, 8]
 
 @dataclass(frozen=True)
 class Specimen:
-    """A whole file, and how it is read.
+    """A whole file, and how it is read."""
 
-    Attributes:
-        name: of the file, from the folder that it lies in; the part before a ``/`` tells specimens apart.
-        data: its bytes.
-        read: what is asked to read it, given its path.
-        beside: other files of the same folder, by name.
-        damage: how it is damaged.
-    """
-
-    name: str
+    name: str  # from the folder that it lies in; the part before a ``/`` tells specimens apart
     data: bytes
-    read: Callable[[Path], object]
-    beside: dict[str, bytes] = field(default_factory=dict)
+    read: Callable[[Path], object]  # of its path
+    beside: dict[str, bytes] = field(default_factory=dict)  # other files of the same folder, by name
     damage: Damage = damaged
 
 
@@ -73,13 +64,10 @@ def _clouds(folder: Path) -> Iterator[Specimen]:
     for order, name in (("<", "little"), (">", "big"), ("", "ascii")):
         for polygons, label in ((FACES, "even"), (list(QUADS[:3]) + list(FACES[6:]), "uneven")):
             yield Specimen(f"{label}_{name}.ply", _mesh_ply(order, polygons), datasets.read_cloud)
-    for save, suffix, arrays in ((np.save, "npy", (np.hstack((points, normals)),)), (np.savez_compressed, "npz", None)):
-        memory = io.BytesIO()
-        if arrays is None:
-            save(memory, points=points, normals=normals, colors=colors)  # pyright: ignore[reportCallIssue]
-        else:
-            save(memory, *arrays)
-        yield Specimen(f"cloud.{suffix}", memory.getvalue(), datasets.read_cloud)
+    np.save(folder / "cloud.npy", np.hstack((points, normals)))
+    np.savez_compressed(folder / "cloud.npz", points=points, normals=normals, colors=colors)
+    for name in ("cloud.npy", "cloud.npz"):
+        yield Specimen(name, (folder / name).read_bytes(), datasets.read_cloud)
     import laspy
 
     las = laspy.create(point_format=3, file_version="1.2")
@@ -126,12 +114,9 @@ def _meshes(folder: Path) -> Iterator[Specimen]:
     )
     yield Specimen("cube.ply", _mesh_ply("<", FACES), datasets.read_textured)
     corners = CUBE[FACES].astype("<f4")
-    yield Specimen(
-        "cube.off",
-        (f"OFF\n{len(CUBE)} {len(FACES)} 0\n" + "\n".join("{:g} {:g} {:g}".format(*v) for v in CUBE) + "\n").encode()
-        + "\n".join("3 {} {} {}".format(*face) for face in FACES).encode(),
-        datasets.read_cloud,
-    )
+    off = [f"OFF\n{len(CUBE)} {len(FACES)} 0", *("{:g} {:g} {:g}".format(*vertex) for vertex in CUBE)]
+    off += ["3 {} {} {}".format(*face) for face in FACES]
+    yield Specimen("cube.off", "\n".join(off).encode(), datasets.read_cloud)
     facets = b"".join(struct.pack("<12fH", 0, 0, 1, *triangle.reshape(-1), 0) for triangle in corners)
     yield Specimen("cube.stl", b"\0" * 80 + struct.pack("<I", len(corners)) + facets, datasets.read_cloud)
     lines = "".join(
@@ -224,12 +209,16 @@ def _within_glb(data: bytes, chance: random.Random) -> bytes:
 
 
 def _within_safetensors(data: bytes, chance: random.Random) -> bytes:
-    """Damage to our own description within the head, in a file whose lengths fit."""
+    """Damage to our own description within the head."""
+    return described_anew(data, lambda described: damaged_json(described, chance))
+
+
+def described_anew(data: bytes, change: Callable[[Any], Any]) -> bytes:
+    """A safetensors file with another description within the head, whose lengths fit."""
     (length,) = struct.unpack_from("<Q", data)
     head = json.loads(data[8 : 8 + length])
     (form,) = head["__metadata__"]
-    described = damaged_json(json.loads(head["__metadata__"][form]), chance)
-    head["__metadata__"][form] = json.dumps(described)
+    head["__metadata__"][form] = json.dumps(change(json.loads(head["__metadata__"][form])))
     text = json.dumps(head).encode()
     text += b" " * (-len(text) % 8)
     return struct.pack("<Q", len(text)) + text + data[8 + length :]

@@ -1,14 +1,9 @@
 """A stand-in accelerator: it keeps its numbers on the CPU, computes there, and refuses what a GPU would refuse.
 
-PyTorch lends a device type to whoever brings a backend ("PrivateUse1"); here it is called ``standin``. A tensor of
-it is a `StandInTensor`, a shell that holds a tensor of the CPU. Each operation on shells comes to `_run`, which
-
-* refuses operands that lie on two devices (but for 0-dimensional tensors of the host where CUDA takes them as numbers,
-  and indices), generators of another device, `.numpy()`, and copies to the host that do not wait;
-* counts launches, and moments at which the host would wait (`ledger.py`);
-* runs the operation on what the shells hold, so that results are those of the CPU to the last bit.
-
-What it cannot show: other roundings, other random numbers, races between streams, and time.
+PyTorch lends a device type to backends ("PrivateUse1"); here it is ``standin``. Its tensors are shells of tensors of
+the CPU, so that results are the CPU's to the last bit. Each operation on shells comes to `_run`, which counts launches
+and waits (`ledger.py`) and refuses what CUDA refuses: operands on two devices, generators of another device,
+`.numpy()`, and copies to the host that do not wait. It cannot show other roundings, races of streams, or time.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""What a piece of work asks of the device: kernels that it launches, and moments at which the host waits for them.
-
-A GPU works behind the host's back until somebody wants to know something of it. Then the host stands still until all
-that was asked for before is done. On small batches that is most of the time, and no profile of a CPU shows it.
-"""
+"""The kernels that a workload launches on the device, and the moments at which the host waits for them."""
 
 import sys
 from collections import Counter

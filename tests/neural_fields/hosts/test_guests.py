@@ -82,9 +82,8 @@ def test_fields_can_be_mapped_and_differentiated(index: int) -> None:
 
 
 def test_networks_with_other_weights_are_mapped_over_them() -> None:
-    """An ensemble: one field, several sets of parameters."""
     members = [Siren(8, 1).requires_grad_(False) for _ in range(3)]
-    parameters, buffers = func.stack_module_state(members)  # pyright: ignore[reportArgumentType]
+    parameters, buffers = func.stack_module_state(members)
     x = points()
 
     def call(parameters: dict[str, Tensor], buffers: dict[str, Tensor]) -> Tensor:

@@ -32,6 +32,8 @@ def test_either_order_is_one_jet_and_each_half_is_served_once() -> None:
     assert torch.equal(output, again)
     assert torch.equal(gradient, shell.gradient(x))
     assert field.jets == 100
+    assert len(shell(x)) == len(shell.gradient(x.clone()))  # other points of the same values
+    assert field.jets == 200
 
 
 def halved(parameter: Tensor) -> None:
@@ -96,16 +98,6 @@ def test_the_second_half_has_a_whole_graph(between: str) -> None:
     shell.gradient(x)
     assert field.jets == jets + 50
     assert part.requires_grad
-
-
-def test_other_points_of_the_same_values_are_evaluated() -> None:
-    shell, field = counting()
-    x = points()
-    output, gradient = shell(x), shell.gradient(x.clone())
-    assert field.jets == 100
-    shell.gradient(x)
-    assert field.jets == 150
-    assert len(output) == len(gradient)
 
 
 def test_an_evaluation_without_graph_does_not_serve_a_training_step() -> None:

@@ -5,34 +5,20 @@ from collections.abc import Callable
 import pytest
 import torch
 from bounds import assert_within, rounding
-from fields import Watched, small_multiscale
-from mplicits.neural_fields import Field, Jet, Moving, MultiscaleSDF, RigidMotion, Siren, Sphere, TimeSlice
-from mplicits.neural_fields.fields.field import OneLevelField
+from fields import Watched, cube, small_multiscale
+from mplicits.neural_fields import Field, FunctionField, Moving, MultiscaleSDF, RigidMotion, Siren, Sphere, TimeSlice
 from torch import Tensor
 
 
-class Constant(OneLevelField):
-    """A residual that is the same everywhere."""
-
-    def __init__(self, constant: float) -> None:
-        super().__init__()
-        self.constant = constant
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        return x.new_full(x.shape[:-1], self.constant)
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        return Jet(self.value(x), torch.zeros_like(x), x.new_empty((*x.shape[:-1], 0)))
-
-
 def watched_levels() -> tuple[MultiscaleSDF, list[Watched]]:
-    levels = [Watched(Sphere(radius=0.5)), Watched(Constant(0.01)), Watched(Constant(0.02))]
+    residuals = [FunctionField(lambda x, c=constant: 0 * x[..., 0] + c) for constant in (0.01, 0.02)]
+    levels = [Watched(field) for field in (Sphere(radius=0.5), *residuals)]
     return MultiscaleSDF(levels[0], levels[1:], [0.1, 0.05]), levels
 
 
 def test_sum_of_the_paper_is_the_field() -> None:
     sdf = small_multiscale().double()
-    x = 2 * torch.rand(500, 3, dtype=torch.float64) - 1
+    x = cube(500)
     base, *residuals = sdf.levels
     f = base.value(x)
     inside = torch.ones(len(x), dtype=torch.bool)
@@ -69,7 +55,7 @@ def test_every_level_is_evaluated_once_and_only_in_its_band(method: str, level: 
     rows = [len(x), int(in_first.sum()), int(in_both.sum())]
     assert 0 < rows[2] < rows[1] < 1000
     METHODS[method](field, x, level)
-    # The band of a level is that of the coarser ones: the level itself is not asked.
+    # The band of a level is that of the coarser ones.
     needed = level if method == "in_band" else level + 1
     asked = [count if index < needed else 0 for index, count in enumerate(rows)]
     jets = method in ("jet", "second_jet")
@@ -104,8 +90,7 @@ def test_with_level_shares_the_levels() -> None:
     base, residual = Siren(8, 1), Siren(8, 2)
     one = MultiscaleSDF(base, [], [])
     two = one.with_level(residual, delta=0.2)
-    assert two.base is base
-    assert two.num_levels == 2
+    assert (two.base, two.num_levels) == (base, 2)
     assert torch.equal(two.deltas, torch.tensor([0.2]))
     x = torch.rand(20, 3)
     assert torch.equal(two.value(x, level=0), one.value(x))

@@ -1,4 +1,4 @@
-"""The peers: gradients against autograd, the contract of fields, and what their papers say of them."""
+"""The network of NeuS: its size and its start."""
 
 import torch
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF

@@ -92,7 +92,6 @@ def test_a_solved_start_draws_nothing_and_leaves_features_and_units() -> None:
 
 
 def test_a_trained_start_does_not_depend_on_units() -> None:
-    """Powers of two round nothing, so that the same numbers come to the bit."""
     found = []
     for units in ((1.0, 1.0), (0.5, 0.25)):
         torch.manual_seed(4)

@@ -55,9 +55,7 @@ def test_a_ball_that_turns_and_travels_is_met_where_it_is(tolerance):
         assert float((found.depth - expected)[found.mask].abs().max()) < 1.01 * tolerance
 
 
-@pytest.mark.parametrize(
-    "step", [pytest.param(0.002, marks=pytest.mark.slow), 0.02, pytest.param(0.2, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("step", [0.02, *(pytest.param(step, marks=pytest.mark.slow) for step in (0.002, 0.2))])
 def test_frames_are_those_from_scratch_however_far_apart_they_are(step):
     eye, directions = image(dtype=torch.float64)
     field = Moving(Torus(major=0.5, minor=0.2), RigidMotion(axis=(1.0, 1.0, 0.0), angle=3.0, velocity=(0.2, 0.0, 0.3)))
@@ -68,7 +66,6 @@ def test_frames_are_those_from_scratch_however_far_apart_they_are(step):
 
 
 def test_what_comes_into_view_in_front_of_the_last_hit_is_found():
-    """A small ball crosses in front of a large one, in steps longer than it is wide."""
     eye, directions = image(dtype=torch.float64)
     small, start, drift = 0.06, (-0.6, 0.1, 0.6), (1.2, 0.0, 0.0)
     field = Union(ball(0.5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ball(small, start, drift)).double()
@@ -154,7 +151,7 @@ def test_near_is_where_rays_pass_within_reach():
     passing = near.clear.isfinite() & ~found.mask
     assert int(passing.sum()) > 50
     assert int((found.mask | near.clear.isinf()).sum()) > 50
-    # Whoever notes something came within reach, and was clear of it where it says so.
+    # A ray with a note came within reach, and was clear of it where the note says so.
     assert bool((outer.isfinite() | near.clear.isinf()).all())
     assert bool((near.clear <= outer)[near.clear.isfinite()].all())
     noted = near.clear.isfinite() & near.value.isfinite()
@@ -165,7 +162,6 @@ def test_near_is_where_rays_pass_within_reach():
     left = passing & near.leave.isfinite()
     assert int(left.sum()) > 20
     assert float(ball.value(behind)[left].min()) >= reach
-    # A ray that passes well within reach cannot have strode over it.
     along = -(eye * directions).sum(dim=-1)
     closest = ball.value(eye + along[..., None] * directions)
     assert bool(near.clear.isfinite()[closest < 0.5 * reach].all())
@@ -186,13 +182,10 @@ def test_frames_in_between_leave_out_what_is_far_and_cost_little_where_it_is_nea
         assert int((hits.mask != fresh.mask).sum()) <= 1
         apart = (hits.depth - fresh.depth)[hits.mask & fresh.mask].abs()
         assert float((apart < 6e-4).float().mean()) > 0.998
-    between = [cost for cost, between in zip(costs, kinds, strict=True) if between]
-    keys = [cost for cost, between in zip(costs[1:], kinds[1:], strict=True) if not between]
+    between, keys = ([cost for cost, kind in zip(costs, kinds, strict=True) if kind is same] for same in (True, False))
     assert len(between) >= 8
-    assert len(keys) >= 1
-    assert max(between[1:]) < 0.4 * min(keys)
-    steady = hits.steps[hits.mask] == 1
-    assert float(steady.float().mean()) > 0.5
+    assert max(between[1:]) < 0.4 * min(keys[1:])
+    assert float((hits.steps[hits.mask] == 1).float().mean()) > 0.5
 
 
 @pytest.mark.parametrize("speed", [0.3, 1.5])

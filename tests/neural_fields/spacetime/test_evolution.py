@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from fields import SCREW, small_spacetime
-from mplicits.neural_fields import Box, Moving, Siren, Sphere, Torus, at_time
+from mplicits.neural_fields import Box, FunctionField, Moving, Siren, Sphere, Torus, at_time
 from mplicits.neural_fields.spacetime import evolution
 from mplicits.neural_fields.spacetime.field import spacetime_jet
 from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
@@ -30,15 +30,7 @@ def test_rigid_motions_obey_transport(shape: Sphere | Torus | Box, extend: bool)
 
 def test_extension_keeps_a_distance_a_distance() -> None:
     """V = x swells a sphere as r = r₀ eᵗ. Its distance obeys the extended law, and the plain one on the surface."""
-
-    class Swelling(Siren):
-        def jet(self, x: Tensor, *, level: int = -1):
-            jet = super().jet(x, level=level)
-            length, radius = x[..., :3].norm(dim=-1), 0.4 * x[..., 3].exp()
-            gradient = torch.cat((x[..., :3] / length[..., None], -radius[..., None]), dim=-1)
-            return jet._replace(value=length - radius, gradient=gradient)
-
-    field = Swelling(4, 1, in_dim=4).double()
+    field = FunctionField(lambda x: x[..., :3].norm(dim=-1) - 0.4 * x[..., 3].exp(), in_dim=4)
     x = samples(500, least=0.1)
     away = spacetime_jet(field, x)
     assert float(evolution.transport(lambda x, t: x, extend=True).residual(away).abs().max()) < 1e-12

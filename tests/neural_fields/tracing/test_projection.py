@@ -20,8 +20,15 @@ def torus_point(u: Tensor, v: Tensor, minor: float | Tensor = MINOR) -> Tensor:
     return torch.stack((ring * torch.cos(u), ring * torch.sin(u), minor * torch.sin(v)), dim=-1)
 
 
-def angles(count: int) -> tuple[Tensor, Tensor]:
-    return tuple(2 * math.pi * torch.rand(2, count, dtype=torch.float64))  # type: ignore[return-value]
+def random_shell(count: int, least: float, most: float) -> Tensor:
+    """Points whose distance from the origin is between two."""
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, dtype=torch.float64), dim=-1)
+    return directions * (least + (most - least) * torch.rand(count, 1, dtype=torch.float64))
+
+
+def angles(count: int) -> Tensor:
+    """``(2, count)``."""
+    return 2 * math.pi * torch.rand(2, count, dtype=torch.float64)
 
 
 class _Squared(OneLevelField):
@@ -54,8 +61,7 @@ def test_shapes(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
 
 
 def test_a_field_that_is_no_distance_takes_several_steps() -> None:
-    x = torch.randn(500, 3, dtype=torch.float64)
-    x = x / x.norm(dim=-1, keepdim=True) * (0.3 + 0.6 * torch.rand(500, 1, dtype=torch.float64))
+    x = random_shell(500, 0.3, 0.9)
     feet, arrived = project_to_surface(_Squared(), x, tolerance=1e-10)
     assert arrived.all()
     torch.testing.assert_close(feet, x / x.norm(dim=-1, keepdim=True) / 2, rtol=0, atol=1e-9)
@@ -108,6 +114,8 @@ def test_shifted_surfaces_have_the_colors_of_their_closest_points(shift: float) 
     colors, reached = map_colors(texture, surface, batch=300)
     assert reached.all()
     torch.testing.assert_close(colors, texture.colors(torus_point(u, v)), rtol=0, atol=1e-10)
+    colors, reached = map_colors(texture, surface[:0])
+    assert (colors.shape, reached.shape) == ((0, 3), (0,))
 
 
 def test_points_of_the_band_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,17 +139,9 @@ def test_points_that_are_not_reached_get_the_color_of_outside() -> None:
 
 
 def test_normals_of_a_fine_surface_on_a_coarse_one() -> None:
-    """Neural normal mapping at traced or meshed points: of a polyhedron, say, inside the sphere."""
     sphere = Sphere(radius=0.5).double()
-    points = torch.randn(300, 3, dtype=torch.float64)
-    points = points / points.norm(dim=-1, keepdim=True) * (0.3 + 0.3 * torch.rand(300, 1, dtype=torch.float64))
+    points = random_shell(300, 0.3, 0.6)
     normals, reached = map_attribute(sphere, lambda x: sphere.jet(x).gradient, points.reshape(3, 100, 3), delta=0.05)
     assert reached.shape == (3, 100)
     assert reached.all()
     torch.testing.assert_close(normals.reshape(-1, 3), points / points.norm(dim=-1, keepdim=True))
-
-
-def test_no_points() -> None:
-    colors, reached = map_colors(exact_texture(0.1), torch.empty(0, 3, dtype=torch.float64))
-    assert colors.shape == (0, 3)
-    assert reached.shape == (0,)

@@ -11,11 +11,11 @@ F64 = torch.float64
 
 
 def along_plane(offset: float, angle: float, samples: int, span: float = 2.0) -> tuple[torch.Tensor, ...]:
-    """Section middles, values, slopes and lengths on a ray that meets a plane at depth ``offset`` under an angle."""
+    """Values, slopes and lengths of the sections of a ray that meets a plane at depth ``offset`` under an angle."""
     cosine = -math.cos(angle)
     edges = torch.linspace(0, span, samples + 1, dtype=F64)[None]
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
-    return middle, cosine * (middle - offset), torch.full_like(middle, cosine), edges.diff(dim=1)
+    return cosine * (middle - offset), torch.full_like(middle, cosine), edges.diff(dim=1)
 
 
 class TestOpticalDepth:
@@ -46,7 +46,6 @@ class TestOpticalDepth:
         alpha = volume.neus_alpha(value, torch.tensor(-1.0), torch.tensor(0.5), 1000.0)
         alpha.sum().backward()
         assert alpha.tolist() == [1, 0]
-        assert value.grad is not None
         assert bool(value.grad.isfinite().all())
 
 
@@ -62,27 +61,15 @@ class TestWeights:
                 light *= 1 - alpha
             assert float(remaining[ray]) == pytest.approx(light, abs=1e-14)
 
-    def test_sum_to_one_with_what_remains(self) -> None:
-        weights, remaining = volume.transmittance_weights(torch.rand(20, 64, dtype=F64) * 0.2)
-        torch.testing.assert_close(weights.sum(dim=1) + remaining, torch.ones(20, dtype=F64))
-        assert bool((weights <= 1).all())
-        assert bool((weights >= 0).all())
-
     def test_no_sections_leave_all_the_light(self) -> None:
         weights, remaining = volume.transmittance_weights(torch.empty(2, 0))
         assert weights.shape == (2, 0)
         assert remaining.tolist() == [1, 1]
 
     @pytest.mark.parametrize("angle", [0.0, 0.6, 1.2])
-    def test_of_a_plane_peak_at_the_plane_unbiased(self, angle: float) -> None:
-        # The paper of NeuS proves it for the first order: the density's maximum is where f = 0, whatever the angle.
-        middle, value, slope, interval = along_plane(0.8, angle, 4000)
-        weights, _ = volume.transmittance_weights(volume.neus_optical_depth(value, slope, interval, 40.0))
-        assert float(middle[0, weights.argmax()]) == pytest.approx(0.8, abs=1e-3)
-
-    def test_of_a_plane_are_the_logistic_density(self) -> None:
+    def test_of_a_plane_are_the_logistic_density(self, angle: float) -> None:
         # Telescoping: the light behind depth t is Φ(f(t)) / Φ(f(0)), exactly, on any sections.
-        _, value, slope, interval = along_plane(0.8, 0.5, 37)
+        value, slope, interval = along_plane(0.8, angle, 37)
         s = 40.0
         weights, remaining = volume.transmittance_weights(volume.neus_optical_depth(value, slope, interval, s))
         ends = value + slope * interval / 2
@@ -99,8 +86,7 @@ class TestDepths:
         torch.testing.assert_close(near[:2], torch.tensor([2.0, 2.2], dtype=F64))
         torch.testing.assert_close(far[:2], torch.tensor([4.0, 3.8], dtype=F64))
         assert near[2] == far[2]  # misses
-        assert (float(near[3]), float(far[3])) == (0, 1)  # starts inside
-        assert (float(near[4]), float(far[4])) == (0, 0)  # looks away
+        assert (near[3:].tolist(), far[3:].tolist()) == ([0, 0], [1, 0])  # starts inside, looks away
 
     def test_sphere_span_from_a_thousand_radii_away_keeps_its_digits(self) -> None:
         near, far = volume.sphere_span(torch.tensor([[0.8, 0.0, 1000.0]]), torch.tensor([[0.0, 0.0, -1.0]]))

@@ -21,7 +21,5 @@ ADA = SimpleNamespace(shared_memory_per_multiprocessor=100 << 10, max_threads_pe
         (255, 300 << 10, 8, HOPPER, 1),  # more than there is: the launch itself will say so
     ],
 )
-def test_programs_of_a_multiprocessor(
-    registers: int, shared: int, warps: int, device: SimpleNamespace, expected: int
-) -> None:
+def test_programs_of_a_multiprocessor(registers, shared, warps, device, expected) -> None:
     assert resident_programs(registers, shared, warps, device) == expected
