@@ -53,13 +53,7 @@ def few_points(patch: pytest.MonkeyPatch) -> None:
 
 
 def ball(path: Path, radius: float, *, levels: bool = False) -> None:
-    """A fit of a ball around (5, 0, 0), twice as large in input coordinates; off by less than 0.01.
-
-    Args:
-        path: of the file.
-        radius: in unit-sphere coordinates.
-        levels: whether it is a multiscale field of one level, as those that `fit` makes.
-    """
+    """A fit of a ball around (5, 0, 0), twice as large in input coordinates; a multiscale field with ``levels``."""
     siren = Siren(24, 2, omega=3.0)
     adam = torch.optim.Adam(siren.parameters(), lr=1e-2, betas=(0.9, 0.99))
     for step in range(200):

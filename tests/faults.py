@@ -28,22 +28,13 @@ class Killed(BaseException):
 
 
 class Faults:
-    """Operations of a block, counted, one of which goes wrong.
-
-    Args:
-        at: the number of that one, from 0; None for none.
-        kind: one of `KINDS`.
-
-    Attributes:
-        count: how many there have been.
-    """
+    """Operations of a block, counted; the one with the number ``at`` goes wrong, if there is one."""
 
     def __init__(self, at: int | None = None, kind: str = "killed") -> None:
         self.at, self.kind, self.count, self.dead = at, kind, 0, False
 
     @contextmanager
     def injected(self) -> Iterator[Faults]:
-        """A block in which they count and fail."""
         with pytest.MonkeyPatch.context() as patch:
             for name in OPERATIONS:
                 patch.setattr(disk, name, self._instead(name, getattr(disk, name)))

@@ -22,11 +22,20 @@ def cube(*shape: int, dim: int = 3, dtype: torch.dtype = torch.float64) -> Tenso
     return 2 * torch.rand(*shape, dim, dtype=dtype) - 1
 
 
+def sphere_depth(origins: Tensor, directions: Tensor, radius: float, center: Tensor | float = 0.0) -> Tensor:
+    """Where rays of unit directions enter a sphere; infinite for those that miss it."""
+    along = ((center - origins) * directions).sum(dim=-1)
+    squared = radius**2 - (origins - center + along[..., None] * directions).square().sum(dim=-1)
+    return torch.where(squared > 0, along - squared.clamp(min=0).sqrt(), torch.inf)
+
+
+SIZES = [(16, 2), (24, 2), (32, 1)]
+SMALL = {"omegas": [3, 5, 8], "deltas": [0.3, 0.2], "num_features": 2, "residual_gain": 1.0}
+
+
 def small_multiscale(taper: float = 0.0) -> nf.MultiscaleSDF:
     """Three untrained levels whose bands cut the unit cube into parts of comparable size."""
-    return nf.MultiscaleSDF.from_widths(
-        [(16, 2), (24, 2), (32, 1)], omegas=[3, 5, 8], deltas=[0.3, 0.2], taper=taper, num_features=2, residual_gain=1.0
-    )
+    return nf.MultiscaleSDF.from_widths(SIZES, taper=taper, **SMALL)
 
 
 def two_levels() -> nf.MultiscaleSDF:
@@ -36,9 +45,7 @@ def two_levels() -> nf.MultiscaleSDF:
 
 def small_spacetime(taper: float = 0.0) -> nf.SpaceTimeSDF:
     """`small_multiscale` in space-time."""
-    return nf.SpaceTimeSDF.from_widths(
-        [(16, 2), (24, 2), (32, 1)], omegas=[3, 5, 8], deltas=[0.3, 0.2], taper=taper, num_features=2, residual_gain=1.0
-    )
+    return nf.SpaceTimeSDF.from_widths(SIZES, taper=taper, **SMALL)
 
 
 def small_hash_grid() -> HashGridSDF:
@@ -79,7 +86,6 @@ class Watched(nf.Field):
         return self.inner.second_jet(x, level=level, dims=dims)
 
     def counts(self) -> tuple[int, int]:
-        """How many points so far, for values and for jets."""
         return sum(x[..., 0].numel() for x in self.values), sum(x[..., 0].numel() for x in self.jets)
 
 

@@ -55,12 +55,8 @@ class Model(nn.Module):
         self.populate_modules()
 
     def populate_modules(self) -> None:
-        self.field = self.config.sdf_field.setup(
-            aabb=self.scene_box.aabb,
-            spatial_distortion=None,
-            num_images=self.num_train_data,
-            use_average_appearance_embedding=False,
-        )
+        options = {"spatial_distortion": None, "use_average_appearance_embedding": False}
+        self.field = self.config.sdf_field.setup(aabb=self.scene_box.aabb, num_images=self.num_train_data, **options)
         self.lpips = sys.modules["torchmetrics.image.lpip"].LearnedPerceptualImagePatchSimilarity()
         self.anneal_end = 50000
 

@@ -16,7 +16,7 @@ import torch
 from evolutions import few_points
 from fields import small_multiscale, small_spacetime, two_levels
 from hosts import Heads, NeuSHost, ray_samples
-from mplicits.datasets import PointCloud, sample_torus, write_cloud_ply
+from mplicits.datasets import sample_torus, write_cloud_ply
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.clouds.cleaning.prepare import prepare_cloud
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
@@ -28,10 +28,9 @@ from mplicits.neural_fields.tracing.cones import cone_ends, cone_starts
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit.unoriented import SIGNING, give_signs
-from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.training.settings import FitConfig, load_config
 from reconstructions import small_reconstructions
-from test_commands import EVOLVE, FIT, RECONSTRUCT, TEXTURE
+from test_commands import EVOLVE, FIT, RECONSTRUCT, TEXTURE, a_cloud, a_mesh
 from torch import Tensor, nn
 
 from benchmarks.cli import main as benchmarks
@@ -72,9 +71,6 @@ def rays(device: torch.device) -> tuple[Tensor, Tensor]:
 
 def tensors(module: nn.Module) -> list[Tensor]:
     return [*module.state_dict().values()]
-
-
-# --- consumers of a field -----------------------------------------------------------------------------
 
 
 def traced(device: torch.device) -> Result:
@@ -196,9 +192,6 @@ def test_what_uses_a_field(work: Callable[[torch.device], Result], accelerator: 
     same(work, accelerator)
 
 
-# --- trainings ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("recipe", [SirenRecipe(), BaconRecipe(), IdfRecipe(), InstantNgpRecipe("fine"), BanfRecipe()])
 def test_methods_of_the_peers(recipe: object, accelerator: torch.device) -> None:
     cloud = prepare_cloud(sample_torus(300))
@@ -257,12 +250,8 @@ def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest
         folder.mkdir()
         monkeypatch.chdir(folder)
         write_cloud_ply(Path("scan.ply"), cloud)
-        write_cloud_ply(
-            Path("coloured.ply"), PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype(np.float32))
-        )
-        write_mesh(
-            Path("mesh.ply"), nf.extract_mesh(nf.Torus(major=0.5, minor=0.2), resolution=16), nf.Similarity.identity()
-        )
+        a_cloud(Path("coloured.ply"))
+        a_mesh(Path("mesh.ply"))
         write_neus(Path("photos"), scene)
         for command in COMMANDS:
             run = benchmarks if command.startswith("normal-map") else main
@@ -275,4 +264,4 @@ def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest
 
 def test_a_device_that_is_not_there_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
     assert benchmarks(["normals", "--device", "warp"]) == 2
-    assert "--device warp: not usable here" in capsys.readouterr().err
+    assert "--device warp" in capsys.readouterr().err

@@ -83,14 +83,12 @@ WRITTEN = ("-o", "--out", "--mesh", "--json", "--page")
 
 
 def shell_lines(page: Path) -> list[str]:
-    """The lines of a page's shell blocks, without their comments."""
     blocks = re.findall(r"^```sh\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     lines = (line.partition("  #")[0].strip() for block in blocks for line in block.splitlines())
     return [line for line in lines if line]
 
 
 def smallest(line: str) -> list[str]:
-    """The arguments of a line, at the smallest setting."""
     words = shlex.split(line.removeprefix("python -m "))
     small = [SMALLER.get(before, word) for before, word in zip(["", *words[:-1]], words, strict=True)]
     return [*small[1:], *(flag for begin, flags in SMALLEST.items() if fnmatch(line, begin) for flag in flags.split())]
@@ -100,9 +98,6 @@ def read_by(line: str) -> list[str]:
     """The words of a line that may be files or folders that it reads."""
     words = shlex.split(line)
     return [word.rstrip("/") for before, word in pairwise(words) if before not in WRITTEN and not word.startswith("-")]
-
-
-# --- stand-ins: each makes what its name says, as small as it may be -----------------------------------
 
 
 def a_cloud(path: Path) -> None:
@@ -141,7 +136,6 @@ def scans_with_truth(path: Path) -> None:
 
 
 def a_run(path: Path) -> None:
-    """A fit with colours."""
     a_cloud(path.parent / "fitted.ply")
     quietly("fit", path.parent / "fitted.ply", "-o", path, *FIT.split(), "--quiet")
     quietly("texture", path, path.parent / "fitted.ply", *TEXTURE.split(), "--quiet")
@@ -253,7 +247,6 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def reason_to_skip(line: str) -> str | None:
-    """Why a line cannot run here, if it cannot."""
     words = shlex.split(line)
     elsewhere = {  # run by tests of their own, where there is what they need
         "pip": "installs from the network",

@@ -22,29 +22,12 @@ from mplicits.pipelines.training.machine import environment
 
 ROOT = Path(__file__).parent.parent
 # From the ground up. A room imports from those above it in this list, never from those below.
+FIELDS = ("backend", "fields", "networks", "volume", "tracing", "meshing", "spacetime")
+PIPELINES = ("training", "surface", "fit", "texture", "mesh", "render", "web", "evolve", "reconstruct", "cli", "front")
 ROOMS = (
-    "neural_fields/backend",
-    "neural_fields/fields",
-    "neural_fields/networks",
-    "neural_fields/volume",
-    "neural_fields/tracing",
-    "neural_fields/meshing",
-    "neural_fields/spacetime",
-    "neural_fields",
-    "neural_fields/hosts",
-    "datasets",
-    "pipelines/training",
-    "pipelines/surface",
-    "pipelines/fit",
-    "pipelines/texture",
-    "pipelines/mesh",
-    "pipelines/render",
-    "pipelines/web",
-    "pipelines/evolve",
-    "pipelines/reconstruct",
-    "pipelines/cli",
-    "pipelines/front",
-    "pipelines/nerfstudio",
+    *(f"neural_fields/{name}" for name in FIELDS),
+    *("neural_fields", "neural_fields/hosts", "datasets"),
+    *(f"pipelines/{name}" for name in (*PIPELINES, "nerfstudio")),
 )
 FRONT = "pipelines/front"
 FACE = ROOT / "neural_fields" / "__init__.py"  # which offers the names of all folders beside it
@@ -55,20 +38,11 @@ LATE = {"torchdiffeq", "trimesh"}  # and what only inside a function that needs 
 KERNELS = ("neural_fields/backend/kernels", "neural_fields/tracing/picture.py")
 
 # The same for benchmarks, which may import from any room above, by its installed name.
-BENCHMARKS = (
-    "benchmarks/harness",
-    "benchmarks/peers",
-    "benchmarks/shapes",
-    "benchmarks/costs",
-    "benchmarks/scenes",
-    "benchmarks/motion",
-    "benchmarks/paper",
-    "benchmarks/cli",
-)
+MEASURING = ("harness", "peers", "shapes", "costs", "scenes", "motion", "paper", "cli")
+BENCHMARKS = tuple(f"benchmarks/{name}" for name in MEASURING)
 
 
 def sources() -> list[Path]:
-    """The files of the wheel."""
     packages = ("neural_fields", "datasets", "pipelines")
     return sorted(path for package in packages for path in (ROOT / package).rglob("*.py"))
 
@@ -95,7 +69,6 @@ def imports(path: Path, *, nested: bool = True) -> list[tuple[int, str, list[str
 
 
 def imported(path: Path) -> list[Path]:
-    """The files of this project that a file imports from."""
     found = []
     for level, module, names in imports(path):
         if level == 0:
@@ -190,15 +163,13 @@ def test_imports_in_a_fresh_process(code: str) -> None:
 def test_every_folder_with_python_in_it_is_packaged() -> None:
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
     folders = {path.parent.relative_to(ROOT).as_posix() for path in sources()} | {"configs"}
-    assert {package: setuptools["package-dir"][package] for package in setuptools["packages"]} == {
-        package_of(folder): folder for folder in folders
-    }
+    packaged = {package: setuptools["package-dir"][package] for package in setuptools["packages"]}
+    assert packaged == {package_of(folder): folder for folder in folders}
     for path in sources():
         assert (path.parent / "__init__.py").is_file(), f"{path.parent} has no __init__.py"
 
 
 def plain(name: str) -> str:
-    """A distribution's name as indexes compare it."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
@@ -226,27 +197,24 @@ def test_dependencies_are_those_that_are_imported() -> None:
     assert recorded <= needed, f"the record of a run asks for versions of {sorted(recorded - needed)}"
 
 
-@pytest.fixture
-def make() -> str:
-    found = shutil.which("make")
-    if found is None:
-        pytest.skip("there is no make")
-    return found
+needs_make = pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")
 
 
-def test_the_demo_installs_nothing_but_the_package(make: str) -> None:
+@needs_make
+def test_the_demo_installs_nothing_but_the_package() -> None:
     for target, expected in (("demo", ["-e ."]), ("lint", ["-e .", "-e '.[dev]'"])):
-        words = [make, "-n", target, "VENV=none"]
+        words = ["make", "-n", target, "VENV=none"]
         lines = subprocess.run(words, check=True, cwd=ROOT, capture_output=True, text=True).stdout.splitlines()
         installed = [line for line in lines if " pip install " in line]
         assert [line[line.index("-e ") :] for line in installed] == expected
         assert all(" -c constraints.txt " in line for line in installed)
 
 
-def test_make_keeps_what_python_compiles(make: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@needs_make
+def test_make_keeps_what_python_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     rule = f"kept:\n\t@'{sys.executable}' -c 'import sys; print(sys.dont_write_bytecode)'\n"
-    words = [make, "--no-print-directory", "-f", "Makefile", "-f", "-", "kept"]  # whoever runs the tests may be make
+    words = ["make", "--no-print-directory", "-f", "Makefile", "-f", "-", "kept"]  # whoever runs the tests may be make
     done = subprocess.run(words, check=True, cwd=ROOT, capture_output=True, text=True, input=rule)
     assert done.stdout == "False\n"
 

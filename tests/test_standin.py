@@ -162,9 +162,8 @@ def test_waits_name_the_line_that_asked() -> None:
     with standin.counted() as book:
         field.value(x)
     # Each residual is evaluated at the rows of its band, whose number the host has to know.
-    assert [(why, where.split(":")[0]) for why, where in book.waits] == [
-        ("size", "neural_fields/networks/multiscale.py")
-    ]
+    (wait,) = [(why, where.split(":")[0]) for why, where in book.waits]
+    assert wait == ("size", "neural_fields/networks/multiscale.py")
     assert book.synchronisations == field.num_levels - 1
 
 

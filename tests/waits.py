@@ -51,9 +51,8 @@ class Row:
 def three_levels() -> MultiscaleSDF:
     """A sphere of radius ½ with two untrained residuals of the paper's sizes, small, in bands that most rays enter."""
     torch.manual_seed(0)
-    field = MultiscaleSDF.from_widths(
-        [(128, 2), (256, 2), (400, 2)], omegas=[10, 45, 100], deltas=[0.03, 0.015], residual_gain=0.01
-    )
+    sizes, omegas, deltas = [(128, 2), (256, 2), (400, 2)], [10, 45, 100], [0.03, 0.015]
+    field = MultiscaleSDF.from_widths(sizes, omegas=omegas, deltas=deltas, residual_gain=0.01)
     solve_sphere(field.base)
     return field.requires_grad_(False)
 
@@ -135,7 +134,6 @@ def counted_steps() -> Iterator[dict[str, list[standin.Ledger]]]:
 
 
 def training(words: str, names: dict[str, str]) -> list[Row]:
-    """The steps of a command, by stage."""
     with counted_steps() as stages, contextlib.redirect_stdout(io.StringIO()):
         assert command([*words.split(), "--device", standin.NAME]) == 0
     rows = []
@@ -149,7 +147,6 @@ def training(words: str, names: dict[str, str]) -> list[Row]:
 
 
 def rows() -> Iterator[Row]:
-    """All of them; works in the current folder."""
     yield tracing()
     yield drawing()
     for name, ask in (("value", MultiscaleSDF.value), ("jet", MultiscaleSDF.jet)):
@@ -159,7 +156,6 @@ def rows() -> Iterator[Row]:
 
 
 def trainings() -> Iterator[Row]:
-    """The steps of the trainings; works in the current folder."""
     write_cloud_ply(Path("scan.ply"), sample_torus(400))
     yield from training(f"fit scan.ply -o run {FIT}", {"": "`fit`"})
     write_neus(Path("photos"), render_scene(SCENES["painted-sphere"](), views=6, size=12, samples=2))

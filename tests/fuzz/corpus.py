@@ -106,12 +106,9 @@ def _meshes(folder: Path) -> Iterator[Specimen]:
     picture = _png(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
     yield Specimen("cube.obj", obj, datasets.read_textured, {"cube.mtl": material, "cube.png": picture})
     yield Specimen("points.obj", obj, datasets.read_cloud, {"cube.mtl": material, "cube.png": picture})
-    yield Specimen(
-        "cube.mtl", material, _beside(datasets.read_textured, "cube.obj"), {"cube.obj": obj, "cube.png": picture}
-    )
-    yield Specimen(
-        "cube.png", picture, _beside(datasets.read_textured, "cube.obj"), {"cube.obj": obj, "cube.mtl": material}
-    )
+    read = _beside(datasets.read_textured, "cube.obj")
+    yield Specimen("cube.mtl", material, read, {"cube.obj": obj, "cube.png": picture})
+    yield Specimen("cube.png", picture, read, {"cube.obj": obj, "cube.mtl": material})
     yield Specimen("cube.ply", _mesh_ply("<", FACES), datasets.read_textured)
     corners = CUBE[FACES].astype("<f4")
     off = [f"OFF\n{len(CUBE)} {len(FACES)} 0", *("{:g} {:g} {:g}".format(*vertex) for vertex in CUBE)]
@@ -185,7 +182,6 @@ def _png(pixels: np.ndarray) -> bytes:
 
 
 def _beside(read: Callable[[Path], object], name: str) -> Callable[[Path], object]:
-    """Read another file of the same folder."""
     return lambda path: read(path.parent / name)
 
 

@@ -27,7 +27,6 @@ FOUND = sorted((Path(__file__).parent / "found").glob("*.json"))
 
 @functools.cache
 def known() -> list[Specimen]:
-    """All whole files, made once."""
     return specimens()
 
 

@@ -57,7 +57,6 @@ class SphericalHarmonics(nn.Module):
 
 
 def encoding(_dims: int, config: Mapping[str, Any]) -> nn.Module:
-    """tiny-cuda-nn's ``Encoding``."""
     return {"HashGrid": lambda: HashGrid(config), "SphericalHarmonics": SphericalHarmonics}[config["otype"]]()
 
 

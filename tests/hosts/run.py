@@ -42,7 +42,6 @@ def run(args: argparse.Namespace, host: str, scene: Path, row: str, seed: int) -
 
 
 def main() -> None:
-    """Run the rows, each in a process of its own, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument("--neus", type=Path, help="clone of NeuS")

@@ -53,7 +53,6 @@ def sine_network(width: int, depth: int, omega: float) -> nn.Module:
 
 
 def main() -> None:
-    """Print one line per network."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--neus", type=Path, required=True, help="clone of NeuS")
     sys.path.insert(0, str(parser.parse_args().neus))

@@ -38,15 +38,11 @@ def test_round_trip(field: nf.Field, dtype: torch.dtype, tmp_path: Path) -> None
 
 def test_closed_forms_and_combinations_of_fields(tmp_path: Path) -> None:
     scan, far = small_multiscale(0.2), nf.Similarity((0.5, -0.25, 0.125), 0.5)
-    cut = nf.Union(
-        scan, Placed(Bounded(nf.Siren(8, 1), radius=1.5), far), nf.Shell(nf.Torus(), inside=0.125), smooth=0.25
-    )
-    plate = nf.Intersection(
-        nf.Box(half_size=(0.5, 0.25, 0.125)), nf.Plane(normal=(0.0, 0.0, 2.0), offset=0.0625), nf.Capsule()
-    )
-    field = nf.Difference(
-        cut, plate, nf.Offset(scan, -0.0625), nf.Sphere(radius=np.float32(0.25))
-    )  # one part of it twice
+    placed = Placed(Bounded(nf.Siren(8, 1), radius=1.5), far)
+    cut = nf.Union(scan, placed, nf.Shell(nf.Torus(), inside=0.125), smooth=0.25)
+    box, plane = nf.Box(half_size=(0.5, 0.25, 0.125)), nf.Plane(normal=(0.0, 0.0, 2.0), offset=0.0625)
+    plate, ball = nf.Intersection(box, plane, nf.Capsule()), nf.Sphere(radius=np.float32(0.25))
+    field = nf.Difference(cut, plate, nf.Offset(scan, -0.0625), ball)  # `scan` is part of it twice
     nf.save_field(tmp_path / "f.safetensors", field)
     loaded = nf.load_field(tmp_path / "f.safetensors").field
     assert repr(loaded) == repr(field).replace("np.float32(0.25)", "0.25")
@@ -97,7 +93,6 @@ def test_textures_survive_the_disk(tmp_path: Path, dtype: torch.dtype) -> None:
 
 
 def radiance(*, grid: bool = True, outside: bool = True) -> Radiance:
-    """A small one, of random numbers."""
     table = {"levels": 3, "table_size": 64, "features": 2, "coarsest": 2, "finest": 9}
     torch.manual_seed(0)
     color = nf.ViewColor(3, width=8, depth=1, point_frequencies=2, grid=HashEncoding(**table) if grid else None)

@@ -13,15 +13,10 @@ BALL = WorldField(Sphere(radius=RADIUS / SCALE), Similarity(tuple(CENTER), SCALE
 ROUNDING = 16 * 2.0**-24 * 2 * SCALE
 
 
-@pytest.fixture
-def offsets() -> np.ndarray:
+def test_arrays_far_from_the_origin_keep_their_digits() -> None:
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(40, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return directions * rng.uniform(4, 16, (40, 1))
-
-
-def test_arrays_far_from_the_origin_keep_their_digits(offsets: np.ndarray) -> None:
+    offsets = directions / np.linalg.norm(directions, axis=1, keepdims=True) * rng.uniform(4, 16, (40, 1))
     lengths = np.linalg.norm(offsets, axis=1)
     found = BALL.distance(CENTER + offsets)
     assert found.dtype == np.float64
@@ -59,7 +54,9 @@ def test_levels_are_those_of_the_field() -> None:
 def test_tensors_carry_their_graph() -> None:
     points = torch.tensor(np.add(CENTER, (0.0, 0.0, 13.0)), requires_grad=True)
     (gradient,) = torch.autograd.grad(BALL.distance(points), points)
-    torch.testing.assert_close(gradient, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    hits = BALL.trace(points, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), differentiable=True)
+    (slope,) = torch.autograd.grad(hits.depth, points)
+    torch.testing.assert_close((gradient, slope), (torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64),) * 2)
     siren = Siren(8, 1)
     WorldField(siren).distance(torch.rand(4, 3)).sum().backward()
     assert siren.output.weight.grad.any()
@@ -76,13 +73,6 @@ def test_rays_in_input_units_with_directions_of_any_length() -> None:
     assert np.isnan(hits.normal[1]).all()
 
 
-def test_depths_of_tensors_can_be_differentiated() -> None:
-    origin = torch.tensor(np.add(CENTER, (0.0, 0.0, -30.0)), requires_grad=True)
-    hits = BALL.trace(origin, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), differentiable=True)
-    (gradient,) = torch.autograd.grad(hits.depth, origin)
-    torch.testing.assert_close(gradient, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64))
-
-
 @pytest.mark.parametrize("bounds", [None, (CENTER - 12, CENTER + 12)])
 def test_meshes_lie_where_the_input_was(bounds: tuple[np.ndarray, np.ndarray] | None) -> None:
     mesh = BALL.mesh(48, bounds=bounds)
@@ -91,7 +81,5 @@ def test_meshes_lie_where_the_input_was(bounds: tuple[np.ndarray, np.ndarray] | 
 
 
 def test_a_repr_has_the_place_and_the_field() -> None:
-    assert repr(BALL) == (
-        "WorldField(center=(500000.25, 4100000.5, 120), scale=20, field=Sphere(radius=0.5, center=(0.0, 0.0, 0.0)))"
-    )
+    assert "center=(500000.25, 4100000.5, 120), scale=20, field=Sphere(radius=0.5" in repr(BALL)
     assert "taper=0.3" in repr(WorldField(MultiscaleSDF(Sphere(), [], [], taper=0.3)))

@@ -92,21 +92,11 @@ class StandInTensor(Tensor):
 
 
 class _Operation(NamedTuple):
-    """What there is to know of an operation once and for all.
-
-    Attributes:
-        name: without ``aten::`` and overload.
-        launches: whether it runs anything on the device.
-        numbers: whether it takes 0-dimensional tensors of the host for numbers.
-        written: places and names of the arguments that it writes into and returns.
-        composite: whether it is made of others.
-    """
-
-    name: str
-    launches: bool
-    numbers: bool
-    written: tuple[tuple[int, str], ...]
-    composite: bool
+    name: str  # without ``aten::`` and overload
+    launches: bool  # whether it runs anything on the device
+    numbers: bool  # whether it takes 0-dimensional tensors of the host for numbers
+    written: tuple[tuple[int, str], ...]  # places and names of the arguments that it writes into and returns
+    composite: bool  # whether it is made of others
 
     @classmethod
     @functools.cache
@@ -163,11 +153,7 @@ def _argument(args: Sequence[Any], kwargs: Mapping[str, Any], place: tuple[int, 
 
 
 def _check_hosts(operation: _Operation, args: Any, kwargs: Any, hosts: Sequence[Tensor]) -> None:
-    """Refuse operands of the host beside those of the device.
-
-    Raises:
-        RuntimeError: as CUDA raises.
-    """
+    """Refuse operands of the host beside those of the device, by a RuntimeError as CUDA raises it."""
     written = [_argument(args, kwargs, place) for place in operation.written]
     indices = args[1] if operation.name in INDEXED else ()
     for tensor in hosts:
@@ -182,10 +168,7 @@ def _check_hosts(operation: _Operation, args: Any, kwargs: Any, hosts: Sequence[
 
 
 def _note_copy(name: str, args: Any, kwargs: Any) -> None:
-    """Copies inside the device launch a kernel; those that leave it or come into it block.
-
-    Unless they come from pinned memory and are asked not to: other memory is copied there first, when it is its turn.
-    """
+    """Copies inside the device launch a kernel; others block, but for non-blocking ones from pinned memory."""
     if name == "copy_":
         target, source = args[:2]
         asked = args[2] if len(args) > 2 else kwargs.get("non_blocking", False)
@@ -267,8 +250,6 @@ def _is_pinned(tensor: Tensor, device: torch.device | None = None) -> bool:
 
 
 class _Module(_DummyBackendModule):
-    """What ``torch.standin`` is."""
-
     def get_amp_supported_dtype(self) -> list[torch.dtype]:
         return [torch.bfloat16, torch.float16]
 

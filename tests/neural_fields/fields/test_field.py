@@ -1,5 +1,3 @@
-"""Any function as a field, and what a field of one's own needs."""
-
 import mplicits.neural_fields as nf
 import numpy as np
 import pytest
@@ -41,9 +39,8 @@ def test_functions_are_taken_wherever_fields_are() -> None:
         where = torch.cat((x, torch.zeros(20, field.in_dim - 3)), dim=1)
         torch.testing.assert_close(field.value(where), ball(x))
     torch.testing.assert_close(nf.NeuSGeometry(ball)(x)[:, 0], ball(x))
-    torch.testing.assert_close(
-        nf.WorldField(ball, nf.Similarity((1.0, 0.0, 0.0), 2.0)).distance(x), 2 * ball((x - ONE) / 2)
-    )
+    world = nf.WorldField(ball, nf.Similarity((1.0, 0.0, 0.0), 2.0))
+    torch.testing.assert_close(world.distance(x), 2 * ball((x - ONE) / 2))
     with pytest.raises(TypeError, match="field: got a str"):
         nf.extract_mesh("field.safetensors")
     with pytest.raises(TypeError, match="got a float"):
@@ -96,18 +93,17 @@ def test_tensors_of_another_function_are_refused(here: nf.Field, there: nf.Field
 
 
 def test_the_definition_survives_a_file(tmp_path) -> None:
-    torch.save(nf.Siren(8, 1, omega=9).state_dict(), tmp_path / "state.pt")
-    state = torch.load(tmp_path / "state.pt", weights_only=True)
-    nf.Siren(8, 1, omega=9).load_state_dict(state)
-    with pytest.raises(RuntimeError, match="omega is 9"):
-        nf.Siren(8, 1).load_state_dict(state)
-    motion = nf.RigidMotion(velocity=(0.3, 0.0, 0.0))
-    torch.save(nf.Moving(nf.Siren(8, 1), motion).state_dict(), tmp_path / "moving.pt")
-    state = torch.load(tmp_path / "moving.pt", weights_only=True)
-    nf.Moving(nf.Siren(8, 1), motion).load_state_dict(state)
+    moving, still = (nf.Moving(nf.Siren(8, 1), nf.RigidMotion(velocity=(v, 0.0, 0.0))) for v in (0.3, 0.0))
+    for kept, other, words in (
+        (nf.Siren(8, 1, omega=9), nf.Siren(8, 1), "omega is 9"),
+        (moving, still, r"motion is .RigidMotion\(.*0\.3"),
+    ):
+        torch.save(kept.state_dict(), tmp_path / "state.pt")
+        state = torch.load(tmp_path / "state.pt", weights_only=True)
+        kept.load_state_dict(state)
+        with pytest.raises(RuntimeError, match=words):
+            other.load_state_dict(state)
     nf.Sphere(radius=np.float64(1.0)).load_state_dict(nf.Sphere(radius=1).state_dict())
-    with pytest.raises(RuntimeError, match=r"motion is .RigidMotion\(.*0\.3"):
-        nf.Moving(nf.Siren(8, 1), nf.RigidMotion()).load_state_dict(state)
 
 
 def test_a_repr_tells_the_function() -> None:

@@ -30,9 +30,6 @@ def assert_three_steps_lower(loss: Callable[[], Tensor], parameters: Iterable[nn
     assert losses[2] < losses[0]
 
 
-# NeuS
-
-
 def neus(*, scale: float = 1.0, double: bool = False) -> tuple[NeuSGeometry, Counted]:
     """A shell around a tapered field with two features, and the counter inside it."""
     field = Counted(small_multiscale(0.5))
@@ -102,9 +99,6 @@ def test_curvature_is_known_at_points_that_were_marked_late() -> None:
     torch.testing.assert_close(row, expected)
     output.sum().backward()
     assert x.grad is not None
-
-
-# instant-nsr-pl
 
 
 def nsr(**options: float) -> tuple[InstantNSRGeometry, Counted]:
@@ -178,9 +172,6 @@ def test_instant_nsr_mesh_is_in_the_hosts_units() -> None:
     torch.testing.assert_close(mesh["v_pos"].norm(dim=-1), torch.full((len(mesh["v_pos"]),), 0.75), rtol=0, atol=5e-3)
 
 
-# nerfstudio and sdfstudio
-
-
 def studio(heads: type[enum.Enum] = Heads) -> tuple[NerfstudioField, Counted]:
     field = Counted(small_multiscale(0.5))
     return NerfstudioField(field, ViewColor(2, width=16, depth=1), heads=heads, deviation=0.3), field
@@ -238,9 +229,6 @@ def test_nerfstudio_names_of_either_host() -> None:
     lengths = outputs[OldHeads.NORMAL].norm(dim=-1)
     torch.testing.assert_close(lengths, torch.ones_like(lengths))
     assert shell.deviation_network(torch.zeros(4, 3)).shape == (4, 1)
-
-
-# What all of them have
 
 
 def shells(

@@ -1,5 +1,3 @@
-"""A mesh on its way to other programs: trimesh, files, and the coordinates that those are read in."""
-
 import dataclasses
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Features of the position beside a field's own: the geometry stays, and what is learnt goes where it should."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""The hash encoding: the published grid and hash, functions that it must reproduce, and both its derivatives."""
-
 import torch
 from fields import cube
 from mplicits.neural_fields.networks.hash_encoding import HashEncoding, grid_resolutions, spatial_hash, tables_apart

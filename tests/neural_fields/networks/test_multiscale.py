@@ -1,5 +1,3 @@
-"""Gating: where residuals act, what they cost, and the taper's continuity."""
-
 from collections.abc import Callable
 
 import pytest

@@ -1,5 +1,3 @@
-"""The network of NeuS: its size and its start."""
-
 import torch
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 

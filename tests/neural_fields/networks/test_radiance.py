@@ -1,5 +1,3 @@
-"""Colour by direction, and the encodings."""
-
 import torch
 from mplicits.neural_fields import Sphere, ViewColor
 from mplicits.neural_fields.networks.hash_encoding import HashEncoding

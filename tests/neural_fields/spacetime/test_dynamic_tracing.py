@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from fields import SCREW, Watched, small_multiscale, small_spacetime
+from fields import SCREW, Watched, small_multiscale, small_spacetime, sphere_depth
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import Field, Moving, RigidMotion, Sphere, TimeSlice, Torus, Union, sphere_trace
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
@@ -20,12 +20,6 @@ def ball(radius: float, center: tuple[float, float, float], velocity: tuple[floa
 def image(size: int = 48, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
     eye, directions = look_at((0.4, 0.5, 2.6), (0.0, 0.0, 0.0), fov=42.0, width=size, height=size).rays()
     return eye.to(dtype), torch.nn.functional.normalize(directions.to(dtype), dim=-1)
-
-
-def sphere_depth(eye: Tensor, directions: Tensor, center: Tensor, radius: float) -> Tensor:
-    along = ((center - eye) * directions).sum(dim=-1)
-    squared = radius**2 - (eye - center + along[..., None] * directions).square().sum(dim=-1)
-    return torch.where(squared > 0, along - squared.clamp(min=0).sqrt(), torch.inf)
 
 
 def assert_same(field: Field, times, tracer: DynamicTracer, eye: Tensor, directions: Tensor, **settings) -> int:
@@ -49,7 +43,7 @@ def test_a_ball_that_turns_and_travels_is_met_where_it_is(tolerance):
     tracer = DynamicTracer(field, eye, directions, tolerance=tolerance)
     for t in TIMES:
         found = tracer.trace(t)
-        expected = sphere_depth(eye, directions, SCREW.forward(center, t), 0.4)
+        expected = sphere_depth(eye, directions, 0.4, SCREW.forward(center, t))
         assert torch.equal(found.mask, expected.isfinite())
         assert int(found.mask.sum()) > 100
         assert float((found.depth - expected)[found.mask].abs().max()) < 1.01 * tolerance
@@ -73,9 +67,8 @@ def test_what_comes_into_view_in_front_of_the_last_hit_is_found():
     in_front = uncovered = 0
     before = torch.zeros(directions.shape[:-1], dtype=torch.bool)
     for t in torch.linspace(0, 1, 12).tolist():
-        here = torch.tensor(start, dtype=torch.float64) + t * torch.tensor(drift, dtype=torch.float64)
-        large = sphere_depth(eye, directions, torch.zeros(3, dtype=torch.float64), 0.5)
-        near = sphere_depth(eye, directions, here, small)
+        here = torch.tensor(start).double() + t * torch.tensor(drift).double()
+        large, near = sphere_depth(eye, directions, 0.5), sphere_depth(eye, directions, small, here)
         expected = torch.minimum(near, large)
         found = tracer.trace(t)
         assert torch.equal(found.mask, expected.isfinite())
@@ -147,7 +140,7 @@ def test_near_is_where_rays_pass_within_reach():
     eye, directions = image(64, dtype=torch.float64)
     ball, reach = Sphere(radius=0.4).double(), 0.1
     found, _, near = trace_expected(ball, eye, directions, None, reach=reach, tolerance=1e-6)
-    outer = sphere_depth(eye, directions, torch.zeros(3, dtype=torch.float64), 0.4 + reach)
+    outer = sphere_depth(eye, directions, 0.4 + reach)
     passing = near.clear.isfinite() & ~found.mask
     assert int(passing.sum()) > 50
     assert int((found.mask | near.clear.isinf()).sum()) > 50

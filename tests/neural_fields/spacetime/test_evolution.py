@@ -95,11 +95,8 @@ def test_laws_add_scale_and_take_any_callable() -> None:
     law = 2.0 * swell + evolution.transport(SCREW.velocity) * 0.5 + evolution.mean_curvature(0.1)
     assert law.order == 2
     assert (swell + evolution.transport(SCREW.velocity)).order == 1
-    expected = (
-        2 * swell.rate(jet)
-        + 0.5 * evolution.transport(SCREW.velocity).rate(jet)
-        + evolution.mean_curvature(0.1).rate(jet)
-    )
+    terms = [(2, swell), (0.5, evolution.transport(SCREW.velocity)), (1, evolution.mean_curvature(0.1))]
+    expected = sum(factor * term.rate(jet) for factor, term in terms)
     torch.testing.assert_close(law.rate(jet), expected)
     torch.testing.assert_close(law.residual(jet), jet.rate - expected)
     with pytest.raises(ValueError, match=r"order=law\.order"):

@@ -1,5 +1,3 @@
-"""Points that are carried by surfaces whose motion is known."""
-
 import pytest
 import torch
 from fields import SCREW

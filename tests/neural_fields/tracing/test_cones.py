@@ -1,8 +1,6 @@
-"""Cones for tiles of an image: never beyond the surface."""
-
 import pytest
 import torch
-from fields import FIELDS, Scaled
+from fields import FIELDS, Scaled, sphere_depth
 from mplicits.neural_fields import Sphere, sphere_trace
 from mplicits.neural_fields.tracing.cones import cone_starts
 from torch.nn.functional import normalize
@@ -18,8 +16,7 @@ def test_cones_that_find_themselves_behind_the_surface_go_back():
     directions = pinhole(0.1, 64)
     origin = torch.tensor([0.0, 0.0, -2.5], dtype=torch.float64)
     near = cone_starts(Scaled(Sphere(radius=0.6), 1.3).double(), origin, directions)
-    along = -(directions @ origin)
-    expected = along - (along**2 - origin @ origin + 0.6**2).sqrt()
+    expected = sphere_depth(origin, directions, 0.6)
     assert bool(expected.isfinite().all())
     assert bool((near < expected).all())
 

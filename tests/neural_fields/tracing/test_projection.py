@@ -1,12 +1,9 @@
-"""Projection onto exact surfaces, and attributes at points near and far from them."""
-
 import math
 
 import pytest
 import torch
 from bounds import rounding
-from mplicits.neural_fields import Jet, Siren, Sphere, TextureField, Torus, map_colors, project_to_surface
-from mplicits.neural_fields.fields.field import OneLevelField
+from mplicits.neural_fields import FunctionField, Siren, Sphere, TextureField, Torus, map_colors, project_to_surface
 from mplicits.neural_fields.networks.texture import ColorSiren
 from mplicits.neural_fields.tracing.projection import map_attribute
 from torch import Tensor
@@ -31,14 +28,8 @@ def angles(count: int) -> Tensor:
     return 2 * math.pi * torch.rand(2, count, dtype=torch.float64)
 
 
-class _Squared(OneLevelField):
-    """``|x|² − r²``: right on its zero set, wrong as a distance; steps along ∇f stay on the rays."""
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        return x.square().sum(dim=-1) - 0.25
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        return Jet(self.value(x), 2 * x, x.new_empty((*x.shape[:-1], 0)))
+# Right on its zero set, wrong as a distance; steps along its gradient stay on rays from the origin.
+SQUARED = FunctionField(lambda x: x.square().sum(dim=-1) - 0.25)
 
 
 def test_closest_points_of_a_torus() -> None:
@@ -62,15 +53,14 @@ def test_shapes(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
 
 def test_a_field_that_is_no_distance_takes_several_steps() -> None:
     x = random_shell(500, 0.3, 0.9)
-    feet, arrived = project_to_surface(_Squared(), x, tolerance=1e-10)
+    feet, arrived = project_to_surface(SQUARED, x, tolerance=1e-10)
     assert arrived.all()
     torch.testing.assert_close(feet, x / x.norm(dim=-1, keepdim=True) / 2, rtol=0, atol=1e-9)
-    assert not project_to_surface(_Squared(), x, tolerance=1e-10, steps=1)[1].any()
+    assert not project_to_surface(SQUARED, x, tolerance=1e-10, steps=1)[1].any()
 
 
 def test_points_without_a_way_have_not_arrived() -> None:
-    """At the centre of the sphere ∇f has no direction; a network without a zero set has no surface."""
-    feet, arrived = project_to_surface(_Squared(), torch.zeros(1, 3))
+    feet, arrived = project_to_surface(SQUARED, torch.zeros(1, 3))
     assert not arrived.any()
     assert torch.isfinite(feet).all()
     empty = Siren(16, 2, omega=3.0)
@@ -131,7 +121,7 @@ def test_points_of_the_band_stay_where_they_are(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_points_that_are_not_reached_get_the_color_of_outside() -> None:
-    texture = TextureField(_Squared(), ColorSiren(4, 1), delta=0.1, outside=(1, 0, 1))
+    texture = TextureField(SQUARED, ColorSiren(4, 1), delta=0.1, outside=(1, 0, 1))
     colors, reached = map_colors(texture, torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     assert reached.tolist() == [True, False]
     assert colors[1].tolist() == [1, 0, 1]

@@ -7,7 +7,7 @@ import torch
 from fields import FIELDS
 from mplicits.neural_fields import Jet, MultiscaleSDF, Plane, Siren, Sphere, ViewColor, render_volume
 from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
-from mplicits.neural_fields.fields.field import OneLevelField, as_field
+from mplicits.neural_fields.fields.field import as_field
 from mplicits.neural_fields.networks.radiance import Outside
 from mplicits.neural_fields.networks.value_grid import ValueGrid
 from mplicits.neural_fields.volume.render import Rendered, Samples, Sampling, render_samples, sample_depths, sample_rays
@@ -26,7 +26,6 @@ def rays(count: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 def position_color(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
-    """A colour in closed form."""
     return 0.5 + 0.5 * x
 
 
@@ -245,42 +244,23 @@ def test_what_is_behind_something_opaque_is_not_asked_for() -> None:
 
 def test_gradients_reach_the_field_through_the_weights() -> None:
     # Growing the sphere brings its surface nearer: ∂depth/∂bias of f = |x| − r is +1 along the axis.
-    class Shifted(OneLevelField):
-        def __init__(self) -> None:
-            super().__init__()
-            self.bias = torch.nn.Parameter(torch.tensor(0.0, dtype=torch.float64))
-            self.sphere = Sphere(radius=0.5).double()
-
-        def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-            return self.sphere.value(x) + self.bias
-
-        def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-            value, gradient, features = self.sphere.jet(x)
-            return Jet(value + self.bias, gradient, features)
-
-    field, eye = Shifted(), torch.tensor([[0.0, 0, 2]], dtype=torch.float64)
-    seen = render_volume(
-        field, position_color, eye, -eye / 2, inv_std=100.0, sampling=Sampling(uniform=256, importance=256)
-    )
-    (slope,) = torch.autograd.grad(seen.depth.sum(), field.bias)
+    bias, eye = torch.zeros((), dtype=torch.float64, requires_grad=True), EYES[:1].double()
+    field, sampling = as_field(lambda x: x.norm(dim=-1) - 0.5 + bias), Sampling(uniform=256, importance=256)
+    seen = render_volume(field, position_color, eye, -eye / 2, inv_std=100.0, sampling=sampling)
+    (slope,) = torch.autograd.grad(seen.depth.sum(), bias)
     assert float(slope) == pytest.approx(1, abs=0.02)
 
 
 class TestSkipping:
-    """Sections without weight get no jet; the full sum is what all of it is held against."""
-
     def field(self) -> MultiscaleSDF:
         """The finer surface lies 0.01 inside the coarser one, where the weights are estimated."""
-        return MultiscaleSDF(
-            Sphere(radius=0.5).double(), [as_field(lambda x: 0.01 + 0 * x[..., 0])], [0.08], taper=0.3
-        ).double()
+        inside = as_field(lambda x: 0.01 + 0 * x[..., 0])
+        return MultiscaleSDF(Sphere(radius=0.5), [inside], [0.08], taper=0.3).double()
 
     def seen(self, **options: Any) -> Rendered:
         origins, directions = (part.double() for part in rays(300))
-        white = torch.ones(3, dtype=torch.float64)
-        return render_volume(
-            self.field(), position_color, origins, directions, inv_std=150.0, background=white, **options
-        )
+        options |= {"inv_std": 150.0, "background": torch.ones(3, dtype=torch.float64)}
+        return render_volume(self.field(), position_color, origins, directions, **options)
 
     @pytest.mark.parametrize("skip", [1e-2, 1e-4])
     def test_colours_are_off_by_the_skipped_weight_at_most(self, skip: float) -> None:
@@ -324,9 +304,8 @@ class TestSkipping:
         origins, directions = rays(100)
         grid = ValueGrid(48)
         grid.refresh(field)
-        guided = render_volume(
-            wrapped, position_color, origins, directions, inv_std=150.0, alpha_threshold=1e-4, sdf_grid=grid
-        )
+        options = {"inv_std": 150.0, "alpha_threshold": 1e-4, "sdf_grid": grid}
+        guided = render_volume(wrapped, position_color, origins, directions, **options)
         assert base.values == residual.values == 0
         assert base.jets == int((guided.counts > 0).sum())
         full = render_volume(field, position_color, origins, directions, inv_std=150.0)

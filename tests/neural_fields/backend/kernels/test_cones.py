@@ -17,7 +17,6 @@ from torch.nn.functional import normalize
 
 @pytest.fixture
 def counted(watch: Callable[..., list[int]]) -> list[int]:
-    """How many cones were marched each time."""
     return watch(fused, "march_cones", lambda network, cones, *_: len(cones[1]))
 
 

@@ -1,5 +1,3 @@
-"""How many programs of a kernel run at a time, from what the compiled kernel takes."""
-
 from types import SimpleNamespace
 
 import pytest

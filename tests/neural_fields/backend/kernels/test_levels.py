@@ -42,9 +42,8 @@ def assert_exact(field: MultiscaleSDF, x: Tensor, *, least_sure: float = 0.95) -
     exact, rows = exact_copy(field), x.double().cpu()
     jets = [part.jet(rows) for part in exact.levels]
     bounds = [tuple(b.cpu() for b in rounding_bound(x, own.raw(), own.omega, halves=True)) for own in field.levels]
-    sure, value_bound, gradient_bound = gated_bound(
-        [(j.value, j.gradient) for j in jets], bounds, exact.deltas, field.taper
-    )
+    values = [(jet.value, jet.gradient) for jet in jets]
+    sure, value_bound, gradient_bound = gated_bound(values, bounds, exact.deltas, field.taper)
     assert float(sure.float().mean()) >= least_sure
     value, jet, expected = field.value(x), field.jet(x), exact.jet(rows)
     assert_within(value.cpu()[sure], expected.value[sure], value_bound[sure])
@@ -65,7 +64,6 @@ def inside(field: MultiscaleSDF, x: Tensor) -> list[int]:
 
 @pytest.fixture
 def counted(watch: Callable[..., list[str]]) -> list[str]:
-    """The launches, so that a test knows that it tested them."""
     watch(fused, "levels_value", lambda *_: "levels_value")
     return watch(fused, "levels_jet", lambda *_: "levels_jet")
 

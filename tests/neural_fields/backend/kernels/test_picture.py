@@ -33,7 +33,6 @@ def camera(width: int = 24, height: int = 18, **options: Any) -> Camera:
 
 
 def both(field: Field, view: Camera, **options: Any) -> tuple[Seen, Seen]:
-    """What is seen by the kernels, and by PyTorch."""
     place = next(field.parameters()).device
     ours = trace_view(field, view, device=place, **options)
     with mock.patch.dict(os.environ, MPLICITS_KERNELS="off"):

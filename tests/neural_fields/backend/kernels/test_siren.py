@@ -27,7 +27,6 @@ def siren(width: int, depth: int, place: torch.device, **options: Any) -> Siren:
 
 
 def assert_exact(network: Siren, x: torch.Tensor) -> None:
-    """Value and jet by the kernels are those of float64, but for rounding."""
     value, jet = network.value(x), network.jet(x)
     exact = copy.deepcopy(network).cpu().double()
     expected = exact.jet(x.double().cpu())
@@ -44,7 +43,6 @@ def assert_exact(network: Siren, x: torch.Tensor) -> None:
 
 @pytest.fixture
 def counted(watch: Callable[..., list[str]]) -> list[str]:
-    """The calls of the kernels, so that a test knows that it tested them."""
     watch(fused, "siren_value", lambda *_: "siren_value")
     return watch(fused, "siren_jet", lambda *_: "siren_jet")
 

@@ -1,5 +1,3 @@
-"""Which path is taken, and the reason against the other."""
-
 import subprocess
 import sys
 

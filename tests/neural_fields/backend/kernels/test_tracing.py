@@ -50,7 +50,6 @@ def rays(count: int, place: torch.device, aim: float = 0.65) -> tuple[Tensor, Te
 
 
 def both(field: Any, origins: Tensor, directions: Tensor, **options: Any) -> Any:
-    """Hits by one launch, and by PyTorch."""
     options = {"tolerance": TOLERANCE, "resolution": 1e-3} | options
     ours = sphere_trace(field, origins, directions, **options)
     with mock.patch.dict(os.environ, MPLICITS_KERNELS="off"):

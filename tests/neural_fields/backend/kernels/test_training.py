@@ -32,7 +32,6 @@ def gradients_again(network: Siren, x: Tensor) -> Sequence[Tensor]:
 
 @pytest.fixture
 def counted(watch: Callable[..., list[int]]) -> list[int]:
-    """How many points came to the kernel each time."""
     return watch(fused, "jet_backward", lambda x, *_: len(x))
 
 
