@@ -25,26 +25,17 @@ def unit_roundoff(dtype: torch.dtype) -> float:
 
 
 def rounding(field: Module, x: Tensor, evaluate: Callable[[Module, Tensor], Sequence[Tensor]]) -> list[Tensor]:
-    """How far results computed in the precision of ``x`` may be from the exact ones, entry by entry.
+    """A bound on the rounding errors of results that are computed in the precision of ``x``, entry by entry.
 
-    An inner product of n terms, summed in any order, in blocks, with or without fused multiply-add, is the exact one
-    of weights that are changed relatively by at most γ_n = n u / (1 − n u) each (Higham 2002, Sec. 3.1). Much the same
-    holds for a rounded point, a sum with a bias, and a sine that is right to a few units in the last place. So a
-    network in floating point is an exact network of other weights, at another point, and the bound is how much those
-    matter. It is measured in float64: every parameter and every coordinate is multiplied by 1 ± ε with random signs;
-    the change of the result, divided by ε and multiplied by n u, is what changes of γ_n do to it. Depth, ω₀, gates and
-    the size of the weights are all in it.
-
-    The signs are random, so a result that happens to change by little in all draws is given the median change of all
-    results. Where a gate opens or a box has an edge within ε, the bound is as large as the jump.
-
-    Args:
-        field: or any other module, in any precision; it is not changed.
-        x: the points.
-        evaluate: the field at the points → results of any shapes, floating point all of them.
+    A sum of n products, in any order, is the exact sum of weights that are changed relatively by at most
+    γ_n = n u / (1 − n u) each (Higham 2002, Sec. 3.1). Rounded points, biases and sines are much the same. So a network
+    in floating point is an exact network of other weights, at another point. The effect is measured in float64: all
+    parameters and coordinates are multiplied by 1 ± ε with random signs, and the change of the result is divided by ε
+    and multiplied by n u. A result that changes by little in all draws gets the median change of all results. Where a
+    gate opens or a box has an edge within ε, the bound is as large as the jump.
 
     Returns:
-        A bound for each entry of each result, in float64, on the CPU: it is of numbers, wherever they are worked on.
+        A bound for each entry of each result of ``evaluate(field, x)``, in float64, on the CPU.
     """
     exact = copy.deepcopy(field).cpu().double().requires_grad_(False)
     points = x.detach().cpu().double()

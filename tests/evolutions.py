@@ -31,17 +31,8 @@ BRIEF = EvolveConfig(
     resolution=24,
     least_delta=0.05,
 )
-QUICK = replace(
-    BRIEF,
-    widths=(32,),
-    depths=(2,),
-    omegas=(6.0,),
-    steps=(250,),
-    learning_rates=(5e-3,),
-    data_weights=(100.0,),
-    batch=768,
-    samples=8000,
-)
+ONE_LEVEL = {"widths": (32,), "depths": (2,), "omegas": (6.0,), "learning_rates": (5e-3,), "data_weights": (100.0,)}
+QUICK = replace(BRIEF, **ONE_LEVEL, steps=(250,), batch=768, samples=8000)
 
 
 def few_points(patch: pytest.MonkeyPatch) -> None:

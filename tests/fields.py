@@ -11,6 +11,7 @@ from mplicits.neural_fields.networks.hash_encoding import HashEncoding
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
+from mplicits.neural_fields.tracing.sphere import Hits
 from torch import Tensor
 
 from benchmarks.motion.figures import DeformingField, Twisting
@@ -27,6 +28,14 @@ def sphere_depth(origins: Tensor, directions: Tensor, radius: float, center: Ten
     along = ((center - origins) * directions).sum(dim=-1)
     squared = radius**2 - (origins - center + along[..., None] * directions).square().sum(dim=-1)
     return torch.where(squared > 0, along - squared.clamp(min=0).sqrt(), torch.inf)
+
+
+def assert_depths(hits: Hits, expected: Tensor | Hits, tolerance: float) -> None:
+    """Rays hit where the expected depth is finite, or the expected hits are, and at that depth."""
+    if not isinstance(expected, Tensor):
+        expected = torch.where(expected.mask, expected.depth, torch.inf)
+    assert torch.equal(hits.mask, expected.isfinite())
+    assert bool(((hits.depth - expected)[hits.mask].abs() < tolerance).all())
 
 
 SIZES = [(16, 2), (24, 2), (32, 1)]

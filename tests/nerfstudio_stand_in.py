@@ -2,7 +2,7 @@
 
 import enum
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -78,7 +78,6 @@ class Model(nn.Module):
         return (outputs[Heads.RGB] - 0.5).abs().mean() + outputs[Heads.ALPHA].mean() + 0.1 * eikonal
 
 
-@dataclass
 class SchedulerConfig(Config):
     pass
 
@@ -91,7 +90,7 @@ class Scheduler:
 @dataclass
 class Specification:
     config: Any = None
-    description: str = field(default="")
+    description: str = ""
 
 
 MODULES: dict[str, dict[str, Any]] = {

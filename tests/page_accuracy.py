@@ -78,9 +78,8 @@ def main():
                 print(f"{run}, {browser.execute_script('return window.mplicits.renderer.kind')}")
                 accuracy(browser, rounded_field(field, BITS), arguments.up, arguments.size)
                 told = costs(browser, arguments.size[0], range(field.num_levels))
-                names = [f"level {level}" for level in range(field.num_levels)]
-                for row in zip(names, told, strict=True):
-                    print(described(*row))
+                for level, costs_of_level in enumerate(told):
+                    print(described(f"level {level}", costs_of_level))
         finally:
             browser.quit()
 

@@ -102,20 +102,15 @@ def volume_rendered(device: torch.device) -> Result:
     with torch.no_grad():
         field.deltas.mul_(0.1)
     field, color = field.to(device), color.to(device)
-    origin, directions = rays(device)
-    directions = directions.reshape(-1, 3)
+    origins, directions = (part.reshape(-1, 3) for part in torch.broadcast_tensors(*rays(device)))
+    options = {
+        "inv_std": 20.0,
+        "sampling": Sampling(uniform=8, importance=8),
+        "background": torch.ones(3, device=device),
+    }
     found = []
     for generator in (None, torch.Generator().manual_seed(0)):
-        seen = nf.render_volume(
-            field,
-            color,
-            origin.expand_as(directions),
-            directions,
-            inv_std=20.0,
-            sampling=Sampling(uniform=8, importance=8),
-            background=torch.ones(3, device=device),
-            generator=generator,
-        )
+        seen = nf.render_volume(field, color, origins, directions, generator=generator, **options)
         found += [seen.color, seen.opacity, seen.depth, seen.normal]
     (found[4].square().mean() + seen.jet.gradient.norm(dim=-1).mean()).backward()
     return *found, *(parameter.grad for parameter in field.parameters())
@@ -127,9 +122,7 @@ def in_neus(device: torch.device) -> Result:
     host.color.to(device)
     host.inverse_deviation = nn.Parameter(host.inverse_deviation.detach().to(device))
     optimiser = torch.optim.Adam(host.parameters(), lr=1e-3)
-    origin, directions = rays(device)
-    directions = directions.reshape(-1, 3)[::16]
-    origins = origin.expand_as(directions)
+    origins, directions = (part.reshape(-1, 3)[::16] for part in torch.broadcast_tensors(*rays(device)))
     depths = torch.linspace(1.8, 3.2, 8, device=device).expand(len(directions), 8)
     for _ in range(2):
         finer = host.finer_depths(origins, directions, depths)
@@ -175,15 +168,8 @@ def begun_as_spheres(device: torch.device) -> Result:
 
 
 CONSUMERS = (
-    traced,
-    traced_in_time,
-    meshed,
-    volume_rendered,
-    in_neus,
-    in_instant_nsr,
-    in_nerfstudio,
-    in_input_units,
-    begun_as_spheres,
+    *(traced, traced_in_time, meshed, volume_rendered, begun_as_spheres),
+    *(in_neus, in_instant_nsr, in_nerfstudio, in_input_units),
 )
 
 
@@ -195,8 +181,7 @@ def test_what_uses_a_field(work: Callable[[torch.device], Result], accelerator: 
 @pytest.mark.parametrize("recipe", [SirenRecipe(), BaconRecipe(), IdfRecipe(), InstantNgpRecipe("fine"), BanfRecipe()])
 def test_methods_of_the_peers(recipe: object, accelerator: torch.device) -> None:
     cloud = prepare_cloud(sample_torus(300))
-    presets = NGP_PRESETS if isinstance(recipe, InstantNgpRecipe) else recipe.presets
-    settings = presets["fine", "smoke"] if isinstance(recipe, InstantNgpRecipe) else presets["smoke"]
+    settings = NGP_PRESETS["fine", "smoke"] if isinstance(recipe, InstantNgpRecipe) else recipe.presets["smoke"]
     steps = (4,) * len(settings.steps) if isinstance(settings.steps, tuple) else 4
     settings = replace(settings, steps=steps)
 

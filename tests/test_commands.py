@@ -114,10 +114,6 @@ def a_mesh(path: Path) -> None:
     write_mesh(path, extract_mesh(Torus(major=0.5, minor=0.2), resolution=24), Similarity.identity())
 
 
-def meshes(path: Path) -> None:
-    a_mesh(path / "torus.ply")
-
-
 def views(path: Path, *, form: str = "transforms", count: int = 4) -> None:
     small = ("--views", count, "--size", 16, "--samples", 1, "--depths")
     quietly("scene", "painted-sphere", "-o", path, "--format", form, *small)
@@ -129,9 +125,9 @@ def cameras(path: Path) -> None:
 
 
 def scans_with_truth(path: Path) -> None:
+    cloud = sample_torus(400)
     for folder in ("scans", "ground_truth"):
         (path / folder).mkdir(parents=True)
-        cloud = sample_torus(400)
         np.save(path / folder / "anchor.npy", np.concatenate((cloud.points, cloud.normals), axis=1))
 
 
@@ -169,16 +165,12 @@ def depth_maps(path: Path) -> None:
 
 
 STAND_INS: dict[str, Callable[[Path], None]] = {
-    "*scan.ply": a_cloud,
-    "scans/*.ply": a_cloud,
-    "ten_million.ply": a_cloud,
+    **dict.fromkeys(("*scan.ply", "scans/*.ply", "ten_million.ply"), a_cloud),
     "*.ply": a_mesh,
     "*.npz": arrays,
-    "meshes": meshes,
-    "runs/morph": a_motion,
-    "runs/turn": a_motion,
-    "runs/*": a_run,
-    "demo/run": a_run,
+    "meshes": lambda path: a_mesh(path / "torus.ply"),
+    **dict.fromkeys(("runs/morph", "runs/turn"), a_motion),
+    **dict.fromkeys(("runs/*", "demo/run"), a_run),
     "photos": functools.partial(views, count=12),  # three of which are apart by so much that no two share a place
     "srb": scans_with_truth,
     "lego": views,
@@ -194,31 +186,26 @@ def quietly(*words: object) -> None:
     assert main([str(word) for word in words]) == 0
 
 
-class Maker:
-    """Puts stand-ins where they are asked for; those that take a training are made once."""
+@pytest.fixture(scope="module")
+def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], None]:
+    """Make what a line reads under a name, unless it is there; what takes a training is made once and copied."""
+    store = tmp_path_factory.mktemp("store")
 
-    def __init__(self, store: Path) -> None:
-        self.store = store
-
-    def __call__(self, name: str) -> None:
-        """Make what a line reads under this name, if it is one of ours and not there."""
-        make = next((make for pattern, make in STAND_INS.items() if fnmatch(name, pattern)), None)
+    def put(name: str) -> None:
         path = Path(name)
+        make = next((make for pattern, make in STAND_INS.items() if fnmatch(name, pattern)), None)
         if make is None or path.exists():
             return
         path.parent.mkdir(parents=True, exist_ok=True)
-        if make in (a_run, a_motion):
-            kept = self.store / make.__name__
-            if not kept.exists():
-                make(kept)
-            shutil.copytree(kept, path)
-        else:
+        if make not in (a_run, a_motion):
             make(path)
+            return
+        kept = store / make.__name__
+        if not kept.exists():
+            make(kept)
+        shutil.copytree(kept, path)
 
-
-@pytest.fixture(scope="module")
-def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Maker:
-    return Maker(tmp_path_factory.mktemp("store"))
+    return put
 
 
 @pytest.fixture(autouse=True)
@@ -250,8 +237,7 @@ def reason_to_skip(line: str) -> str | None:
     words = shlex.split(line)
     elsewhere = {  # run by tests of their own, where there is what they need
         "pip": "installs from the network",
-        "ns-train": "tests/pipelines/nerfstudio runs it, where nerfstudio is installed",
-        "ns-mplicits-export": "tests/pipelines/nerfstudio runs it, where nerfstudio is installed",
+        **dict.fromkeys(("ns-train", "ns-mplicits-export"), "tests/pipelines/nerfstudio runs it"),
         "python tests/hosts/run.py": "needs a clone of the host",
     }
     for begin, reason in elsewhere.items():

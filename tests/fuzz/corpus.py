@@ -1,7 +1,5 @@
 """Small whole files of every kind that the package reads, and what reads each."""
 
-from __future__ import annotations
-
 import json
 import random
 import struct

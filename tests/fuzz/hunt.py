@@ -3,8 +3,6 @@
 Prints a table. What is neither read nor refused in one line is kept in `tests/fuzz/found`, for the tests to replay.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import faulthandler

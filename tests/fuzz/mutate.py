@@ -1,7 +1,5 @@
 """Damage: what happens to files on the way, and what somebody might do to them on purpose."""
 
-from __future__ import annotations
-
 import json
 import random
 import re

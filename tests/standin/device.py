@@ -161,10 +161,8 @@ def _check_hosts(operation: _Operation, args: Any, kwargs: Any, hosts: Sequence[
             continue
         number = tensor.ndim == 0 and (operation.numbers or operation.name in INDEXED)
         if not number or any(tensor is shell for shell in written):
-            raise RuntimeError(
-                f"Expected all tensors to be on the same device, but found at least two devices, {NAME}:0 and "
-                f"{tensor.device}! ({operation.name}, {tuple(tensor.shape)} on {tensor.device})"
-            )
+            where = f"{operation.name}, {tuple(tensor.shape)} on {tensor.device}"
+            raise RuntimeError(f"Expected all tensors to be on the same device, {NAME}:0, but found {where}")
 
 
 def _note_copy(name: str, args: Any, kwargs: Any) -> None:

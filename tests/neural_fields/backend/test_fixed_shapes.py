@@ -8,7 +8,7 @@ import torch
 from bounds import assert_within, rounding
 from fields import cube, small_multiscale, small_spacetime
 from mplicits.neural_fields import Field, MultiscaleSDF, Similarity, Sphere, TimeSlice, Union
-from mplicits.neural_fields.backend.fixed_shapes import first_rows, fixed_shapes
+from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
 from mplicits.neural_fields.fields.csg import Placed
 from torch import Tensor
 
@@ -86,14 +86,6 @@ def test_few_points(count: int) -> None:
     with fixed_shapes([3, 3]):
         jet = field.jet(x)
     assert jet.gradient.shape == (count, 3)
-
-
-@pytest.mark.parametrize("count", [0, 1, 40, 100])
-def test_first_rows_are_those_of_nonzero(count: int) -> None:
-    mask = torch.rand(100) < 0.4
-    expected = torch.cat((mask.nonzero()[:, 0], torch.full((100,), 100)))[:count]
-    assert torch.equal(first_rows(mask, count), expected)
-    assert torch.equal(first_rows(mask[:0], count), torch.zeros(count, dtype=torch.int64))
 
 
 def assert_no_wait(field: Field, x: Tensor, capacity: list[int] | None) -> dict[str, int]:

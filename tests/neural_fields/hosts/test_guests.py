@@ -139,12 +139,3 @@ def test_half_precision_errs_no_more_than_its_rounding(dtype: torch.dtype) -> No
     assert found.dtype == dtype
     assert bool(((found.double() - wanted).abs() <= error[:, 0]).all())
     assert siren.jet(x).gradient.dtype == dtype
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # PyTorch's compiler of itself
-def test_compiled_fields_agree() -> None:
-    for field in fields()[:2]:
-        x = points()
-        compiled = torch.compile(field.value)
-        torch.testing.assert_close(compiled(x), field.value(x), **VMAP)

@@ -122,6 +122,7 @@ def test_compiled_jets_are_those_of_eager(backend: str) -> None:
     sdf = MultiscaleSDF.from_widths([(16, 2), (24, 2)], omegas=[10, 20], deltas=[0.3], taper=0.3, num_features=4)
     x = cube(64, dtype=torch.float32)
     assert 0 < int(sdf.in_band(x, level=1).sum()) < 64
+    torch.testing.assert_close(torch.compile(sdf.value, backend=backend)(x), sdf.value(x), rtol=1e-5, atol=1e-5)
     plain, compiled = sdf.jet(x), torch.compile(sdf.jet, backend=backend)(x)
     torch.testing.assert_close(tuple(compiled), tuple(plain), rtol=1e-5, atol=1e-5)
     losses = [(jet.gradient.norm(dim=-1) - 1).square().mean() for jet in (compiled, plain)]

@@ -139,10 +139,9 @@ def test_the_adjoint_of_a_track_reaches_the_field() -> None:
     x = torch.rand(8, 3, dtype=torch.float64)
     gradients = []
     for adjoint in (False, True):
-        field.zero_grad()
         solver = Solver(method="rk4", step=0.02, adjoint=adjoint)
-        track(field, x, [0.0, 0.3], project=False, solver=solver).points[-1].square().sum().backward()
-        gradients.append(torch.cat([p.grad.flatten() for p in field.parameters() if p.grad is not None]))
+        loss = track(field, x, [0.0, 0.3], project=False, solver=solver).points[-1].square().sum()
+        gradients.append(torch.autograd.grad(loss, field.parameters(), materialize_grads=True))
     torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-5)
 
 
@@ -156,7 +155,6 @@ def test_a_flow_that_blows_up_reports_the_time_reached() -> None:
     with pytest.raises(IntegrationError, match=r"reached time 0\.(49|5)") as caught:
         flow(blow_up, x, 0.0, 1.0)
     assert float(caught.value.time) == pytest.approx(0.5, abs=1e-2)
-    assert caught.value.points.shape == (1, 3)
     assert float(caught.value.points[0, 0]) > 100
     with pytest.raises(IntegrationError, match=r"more than 5 steps; reached time 0\.\d+") as caught:
         flow(blow_up, x, 0.0, 1.0, solver=Solver(max_steps=5))

@@ -244,10 +244,18 @@ def test_what_is_behind_something_opaque_is_not_asked_for() -> None:
 
 def test_gradients_reach_the_field_through_the_weights() -> None:
     # Growing the sphere brings its surface nearer: ∂depth/∂bias of f = |x| − r is +1 along the axis.
-    bias, eye = torch.zeros((), dtype=torch.float64, requires_grad=True), EYES[:1].double()
-    field, sampling = as_field(lambda x: x.norm(dim=-1) - 0.5 + bias), Sampling(uniform=256, importance=256)
+    class Shifted(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.bias = torch.nn.Parameter(torch.zeros((), dtype=torch.float64))
+
+        def forward(self, x: Tensor) -> Tensor:
+            return x.norm(dim=-1) - 0.5 + self.bias
+
+    shifted, eye = Shifted(), EYES[:1].double()
+    field, sampling = as_field(shifted), Sampling(uniform=256, importance=256)
     seen = render_volume(field, position_color, eye, -eye / 2, inv_std=100.0, sampling=sampling)
-    (slope,) = torch.autograd.grad(seen.depth.sum(), bias)
+    (slope,) = torch.autograd.grad(seen.depth.sum(), shifted.bias)
     assert float(slope) == pytest.approx(1, abs=0.02)
 
 
