@@ -21,8 +21,8 @@ from mplicits.datasets.cameras import look_at
 from mplicits.datasets.clouds.cleaning.prepare import prepare_cloud
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_neus
-from mplicits.neural_fields.networks.radiance import ViewColor
-from mplicits.neural_fields.networks.sphere_init import fit_sphere, solve_sphere
+from mplicits.neural_fields.networks.colors import ViewColor
+from mplicits.neural_fields.networks.multiscale import fit_sphere, solve_sphere
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
 from mplicits.neural_fields.tracing.cones import cone_ends, cone_starts
 from mplicits.neural_fields.volume.render import Sampling

@@ -14,7 +14,7 @@ from unittest import mock
 
 import numpy as np
 import torch
-from mplicits.neural_fields.networks.hash_encoding import HashEncoding
+from mplicits.neural_fields.networks.grids import HashEncoding
 from torch import Tensor, nn
 
 WARM_UP, UPDATE_EVERY, DECAY = 256, 16, 0.95  # of the occupancy grid, as in nerfacc

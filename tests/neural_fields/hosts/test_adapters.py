@@ -17,7 +17,7 @@ from mplicits.neural_fields import (
     Siren,
     Sphere,
 )
-from mplicits.neural_fields.networks.radiance import ViewColor
+from mplicits.neural_fields.networks.colors import ViewColor
 from mplicits.neural_fields.volume.weights import transmittance_weights
 from torch import Tensor, nn
 from torch.nn.functional import normalize, relu

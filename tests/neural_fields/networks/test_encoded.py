@@ -5,7 +5,7 @@ import torch
 from fields import cube, small_encoded, small_multiscale
 from mplicits.neural_fields import NeuSGeometry, Plane, Siren, load_field, save_field
 from mplicits.neural_fields.networks.encoded import EncodedField
-from mplicits.neural_fields.networks.hash_encoding import HashEncoding
+from mplicits.neural_fields.networks.grids import HashEncoding
 
 
 def test_geometry_is_the_fields_own_bit_for_bit() -> None:

@@ -1,6 +1,6 @@
 import torch
 from fields import cube
-from mplicits.neural_fields.networks.hash_encoding import HashEncoding, grid_resolutions, spatial_hash, tables_apart
+from mplicits.neural_fields.networks.grids import HashEncoding, grid_resolutions, spatial_hash, tables_apart
 
 
 def small(**options: int) -> HashEncoding:

@@ -1,7 +1,7 @@
 import pytest
 import torch
 from mplicits.neural_fields import Siren
-from mplicits.neural_fields.networks.sphere_init import fit_sphere, solve_sphere
+from mplicits.neural_fields.networks.multiscale import fit_sphere, solve_sphere
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.5, 0.8])

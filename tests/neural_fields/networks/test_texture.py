@@ -3,7 +3,7 @@ import torch
 from bounds import assert_within, rounding
 from fields import Watched, cube
 from mplicits.neural_fields import Field, MultiscaleSDF, Siren, Sphere, TextureField, Torus
-from mplicits.neural_fields.networks.texture import ColorSiren
+from mplicits.neural_fields.networks.colors import ColorSiren
 from torch import Tensor
 
 

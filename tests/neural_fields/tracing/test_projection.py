@@ -4,8 +4,8 @@ import pytest
 import torch
 from bounds import rounding
 from mplicits.neural_fields import FunctionField, Siren, Sphere, TextureField, Torus, map_colors, project_to_surface
-from mplicits.neural_fields.networks.texture import ColorSiren
-from mplicits.neural_fields.tracing.projection import map_attribute
+from mplicits.neural_fields.networks.colors import ColorSiren
+from mplicits.neural_fields.tracing.sphere import map_attribute
 from torch import Tensor
 
 MAJOR, MINOR = 0.5, 0.2
