@@ -110,9 +110,15 @@ def ray_aabb_intersect(origins: Tensor, directions: Tensor, box: Tensor) -> tupl
 
 
 def ray_marching(
-    rays_o: Tensor, rays_d: Tensor, *, scene_aabb: Tensor, grid: OccupancyGrid | None, render_step_size: float,
-    stratified: bool, **_unused: object,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    rays_o: Tensor,
+    rays_d: Tensor,
+    *,
+    scene_aabb: Tensor,
+    grid: OccupancyGrid | None,
+    render_step_size: float,
+    stratified: bool,
+    **_unused: object,
+) -> tuple[Tensor, Tensor, Tensor]:
     """Steps of one length through the box, in occupied cells alone: rays ``(n,)``, ends ``(n, 1)``."""
     near, far = ray_aabb_intersect(rays_o, rays_d, scene_aabb)
     steps = max(1, math.ceil(((far - near).amax() / render_step_size).item()))

@@ -100,10 +100,8 @@ def test_in_fixed_shapes_rays_see_the_same_if_there_is_room(spare: int | None) -
     origins, directions = (part.double() for part in rays(40))
 
     def render() -> list[Tensor]:
-        seen = render_volume(
-            field, color, origins, directions, inv_std=300.0, sampling=Sampling(12, 8, 2), outside=around,
-            early_stop_eps=0.05, alpha_threshold=0.05,
-        )  # fmt: skip
+        thresholds = {"early_stop_eps": 0.05, "alpha_threshold": 0.05, "sampling": Sampling(12, 8, 2)}
+        seen = render_volume(field, color, origins, directions, inv_std=300.0, outside=around, **thresholds)
         loss = seen.color.square().sum() + (seen.counts * seen.jet.gradient.square().sum(dim=-1)).sum()
         grown = torch.autograd.grad(loss, parameters, allow_unused=True, materialize_grads=True)
         return [seen.color, seen.counts, seen.opacity, seen.depth, seen.normal, seen.weights, *seen.jet, *grown]
