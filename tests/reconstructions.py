@@ -39,10 +39,7 @@ QUICK = {"learning_rate": 2e-3, "color_rate": 12.0, "sharpening": 8.0}
 
 
 def small_reconstructions(patch: pytest.MonkeyPatch) -> None:
-    """Begin by one linear solve or a short fit, and colour few points by a small network.
-
-    How good starts and textures are is tested elsewhere.
-    """
+    """Begin by one linear solve or a short fit, and colour few points by a small network."""
     patch.setattr(scene_model, "fit_sphere", solve_sphere)
     patch.setitem(inspect.unwrap(hull.start_at_hull).__kwdefaults__, "steps", 50)
     finish = reconstruct_texture.FinishOptions(texture_samples=2000, texture_resolution=32)
