@@ -67,7 +67,7 @@ def some_rays(count: int) -> tuple[Tensor, Tensor]:
 
 @contextlib.contextmanager
 def passes_of(field: type[Field]) -> Iterator[list[int]]:
-    """How often values of ``field`` are asked for inside the ``with``, by rows asked."""
+    """The numbers of rows of the evaluations of ``field`` inside the ``with``."""
     asked, value = [], field.value
 
     def watched(self: Field, x: Tensor, *, level: int = -1) -> Tensor:
