@@ -10,6 +10,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from evolutions import fails
 from fields import FIELDS
 from mplicits.datasets import PointCloud, look_at, orbit, write_cloud_ply
 from mplicits.datasets.cameras import Camera
@@ -32,29 +33,26 @@ INSET = 0.01  # by so much is level 1 smaller in value
 REACH = math.acos(0.2) / 2  # of the blob along the axes
 
 
-def blob() -> MultiscaleSDF:
-    """``(2.2 − Σ cos 2(x_i − c_i)) / 4`` and, within 0.05 of its surface, 0.01 more: a field known exactly."""
-    base, residual = Siren(3, 1, omega=2.0), Siren(4, 1, omega=1.0)
+@pytest.fixture(scope="module")
+def blob(cosine_blob) -> MultiscaleSDF:
+    """`cosine_blob` and, within 0.05 of its surface, 0.01 more: a field known exactly."""
+    residual = Siren(4, 1, omega=1.0)
     with torch.no_grad():
-        base.layers[0].weight.copy_(torch.eye(3))
-        base.layers[0].bias.copy_(math.pi / 4 - torch.tensor(CENTER))
-        base.output.weight.fill_(-0.25)
-        base.output.bias.fill_(0.55)
         residual.output.weight.zero_()
         residual.output.bias.fill_(INSET)
-    return MultiscaleSDF(base, [residual], [0.05])
+    return MultiscaleSDF(cosine_blob(CENTER), [residual], [0.05])
 
 
 @pytest.fixture(scope="module")
-def shapes(tmp_path_factory) -> Path:
+def shapes(tmp_path_factory, blob) -> Path:
     """A run, its finest level as meshes and clouds, and a run without a surface."""
     folder = tmp_path_factory.mktemp("shapes")
-    mesh = extract_mesh(blob(), resolution=64)
+    mesh = extract_mesh(blob, resolution=64)
     points = SIMILARITY.to_input(mesh.vertices)
     metadata = {"run": {"cloud": str(folder / "cloud.ply")}}
-    save_field(folder / "blob.safetensors", blob(), similarity=SIMILARITY, metadata=metadata)
-    save_field(folder / "unit.safetensors", blob())
-    save_field(folder / "lost.safetensors", blob(), metadata={"run": {"cloud": "absent.ply"}})
+    save_field(folder / "blob.safetensors", blob, similarity=SIMILARITY, metadata=metadata)
+    save_field(folder / "unit.safetensors", blob)
+    save_field(folder / "lost.safetensors", blob, metadata={"run": {"cloud": "absent.ply"}})
     save_field(folder / "time.safetensors", Siren(8, 1, in_dim=4))
     colors = np.tile(np.float32((0.2, 0.6, 0.4)), (len(points), 1))
     write_mesh(folder / "mesh.ply", replace(mesh, colors=colors), SIMILARITY)
@@ -62,11 +60,7 @@ def shapes(tmp_path_factory) -> Path:
     write_cloud_ply(folder / "cloud.ply", PointCloud(points, mesh.normals))
     np.savetxt(folder / "bare.xyz", points)
     np.savetxt(folder / "dot.xyz", np.ones((3, 3)))
-    nothing = Siren(8, 1)
-    with torch.no_grad():
-        nothing.output.weight.zero_()
-        nothing.output.bias.fill_(1.0)
-    save_field(folder / "nothing.safetensors", nothing)
+    save_field(folder / "nothing.safetensors", Sphere(center=(9.0, 0.0, 0.0)))
     (folder / "broken.json").write_text("{")
     camera = orbit(points, azimuth=50, elevation=30, fov=20, width=40, height=30)
     write_transforms(folder / "transforms.json", {"images/a.png": camera, "images/b.png": camera.resized(48, 36)})
@@ -98,18 +92,9 @@ def render(shapes: Path, source: str, out: Path, *arguments: str) -> np.ndarray:
     return iio.imread(out).astype(float)
 
 
-def read_mp4(path: Path) -> list[np.ndarray]:
-    video, frames = cv2.VideoCapture(str(path)), []
-    while (read := video.read())[0]:
-        frames.append(read[1])
-    return frames
-
-
 def blob_gradient(positions: torch.Tensor) -> torch.Tensor:
     return torch.sin(2 * (positions - torch.tensor(CENTER))) / 2
 
-
-# --- what pixels see -----------------------------------------------------------------------------------
 
 VIEWS = {
     "whole": look_at((1.5, 0.8, 2.5), (0.1, 0.0, -0.1), width=61, height=47),
@@ -146,7 +131,6 @@ def test_a_sphere_is_seen_where_it_is(view):
     assert torch.allclose(seen.normal, (seen.position - center) / radius, atol=1e-3)
     assert torch.allclose(seen.direction, directions[seen.pixel].float(), atol=1e-6)
     assert bool((seen.pixel.diff() > 0).all())
-    assert seen.size == (camera.width, camera.height)
 
 
 @pytest.mark.parametrize("name", [name for name, make in FIELDS.items() if make().in_dim == 3])
@@ -166,8 +150,8 @@ def test_every_field_can_be_seen(name):
     assert torch.allclose(seen.normal.norm(dim=1), torch.ones(len(seen.pixel)), atol=1e-5)
 
 
-def test_normal_mapping_takes_the_gradient_of_a_finer_level_at_the_points_of_a_coarser_one():
-    field = MultiscaleSDF(blob().base, [Siren(16, 2, omega=8.0)], [0.1])
+def test_normal_mapping_takes_the_gradient_of_a_finer_level_at_the_points_of_a_coarser_one(blob):
+    field = MultiscaleSDF(blob.base, [Siren(16, 2, omega=8.0)], [0.1])
     camera = VIEWS["whole"]
     plain, mapped = trace_view(field, camera, level=0), trace_view(field, camera, level=0, normal_level=-1)
     assert torch.equal(mapped.pixel, plain.pixel)
@@ -181,10 +165,10 @@ def test_normal_mapping_takes_the_gradient_of_a_finer_level_at_the_points_of_a_c
     assert torch.allclose(plain.normal, normalize(blob_gradient(plain.position), dim=1), atol=1e-3)
 
 
-def test_levels_are_seen_at_their_own_depths():
+def test_levels_are_seen_at_their_own_depths(blob):
     camera = look_at((CENTER[0], CENTER[1], 3.0), CENTER, width=1, height=1)
     for level, inset in ((0, 0.0), (1, INSET)):
-        depth = trace_view(blob(), camera, level=level).depth
+        depth = trace_view(blob, camera, level=level).depth
         assert float(depth) == pytest.approx(3.0 - CENTER[2] - math.acos(0.2 + 4 * inset) / 2, abs=1e-5)
 
 
@@ -203,36 +187,32 @@ def test_a_field_and_its_mesh_are_seen_alike():
     assert float(off[off.isfinite()].max()) < sag / 0.3
 
 
-# --- the command ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("shading", SHADINGS)
 def test_every_shading_of_a_field_and_of_its_mesh(shapes, tmp_path, shading):
     arguments = ("--shading", shading, "--no-legend", "--fast", "--size", "40")
-    pictures = {}
+    pictures = []
     if shading != "color":
-        pictures["field"] = render(shapes, "blob.safetensors", tmp_path / "field.png", *arguments)
+        pictures.append(render(shapes, "blob.safetensors", tmp_path / "field.png", *arguments))
     if shading != "curvature":
         source = "mesh.ply" if shading == "color" else "plain.obj"
         reference = ("--reference", str(shapes / "cloud.ply")) if shading == "error" else ()
-        pictures["mesh"] = render(shapes, source, tmp_path / "mesh.png", *arguments, *reference)
-    for picture in pictures.values():
+        pictures.append(render(shapes, source, tmp_path / "mesh.png", *arguments, *reference))
+    for picture in pictures:
         assert picture.shape == (40, 40, 3)
-        drawn = (picture < 250).any(axis=2)
-        assert 0.3 < drawn.mean() < 0.7
+        assert 0.3 < (picture < 250).any(axis=2).mean() < 0.7
         assert (picture[[0, 0, -1, -1], [0, -1, 0, -1]] == 255).all()
     if len(pictures) == 2 and shading != "error":
-        assert np.abs(pictures["field"] - pictures["mesh"]).mean() < 3
+        assert np.abs(pictures[0] - pictures[1]).mean() < 3
     if shading == "color":
-        assert np.abs(pictures["mesh"][20, 20] - (51, 153, 102)).max() <= 1
+        assert np.abs(pictures[0][20, 20] - (51, 153, 102)).max() <= 1
 
 
-def test_normals_are_drawn_as_colours_of_the_right_pixels(shapes, tmp_path):
+def test_normals_are_drawn_as_colours_of_the_right_pixels(shapes, tmp_path, blob):
     picture = render(
         shapes, "blob.safetensors", tmp_path / "a.png", "--shading", "normals", "--samples", "1", "--size", "48", "32"
     )
     subject = open_subject(shapes / "blob.safetensors")
-    seen = trace_view(blob(), orbit(subject.outline(), width=48, height=32))
+    seen = trace_view(blob, orbit(subject.outline(), width=48, height=32))
     normals = normalize(blob_gradient(seen.position), dim=1)
     assert np.abs(picture.reshape(-1, 3)[seen.pixel] - (normals.numpy() + 1) * 127.5).max() < 1
 
@@ -259,15 +239,14 @@ def test_strips_do_not_show(shapes, tmp_path, monkeypatch):
 
 
 def test_a_transparent_picture_covers_what_the_shape_does(shapes, tmp_path):
-    arguments = ("--background", "transparent", "--shading", "color", "--size", "30", "--samples", "4")
-    picture = render(shapes, "mesh.ply", tmp_path / "a.png", *arguments)
+    clear, coarse = ("--background", "transparent"), ("--size", "30", "--samples", "4")
+    picture = render(shapes, "mesh.ply", tmp_path / "a.png", *clear, "--shading", "color", *coarse)
     assert picture.shape == (30, 30, 4)
-    fine = render(shapes, "mesh.ply", tmp_path / "b.png", *arguments[:5], "240", "--samples", "1")
+    fine = render(shapes, "mesh.ply", tmp_path / "b.png", *clear, "--size", "240", "--samples", "1")
     assert picture[..., 3].mean() == pytest.approx(fine[..., 3].mean(), rel=0.005)
-    assert picture[..., 3].min(axis=0).max() > 0 or ((picture[..., 3] > 0) & (picture[..., 3] < 255)).sum() > 40
     rim = (picture[..., 3] > 20) & (picture[..., 3] < 235)
     assert np.abs(picture[rim][:, :3] - (51, 153, 102)).max() <= 2  # nothing of a background in it
-    traced = render(shapes, "blob.safetensors", tmp_path / "c.png", *arguments[:2], "--fast", *arguments[4:])
+    traced = render(shapes, "blob.safetensors", tmp_path / "c.png", *clear, "--fast", *coarse)
     assert np.abs(traced[..., 3] - picture[..., 3]).mean() < 0.5
 
 
@@ -340,10 +319,9 @@ def test_posed_cameras_are_in_input_coordinates(shapes, tmp_path, source):
     around = ("--azimuth", "50", "--elevation", "30", "--fov", "20", "--size", "40", "30")
     plain = render(shapes, "plain.obj", tmp_path / "a.png", "--shading", "normals", *around)
     cameras = ("--shading", "normals", "--cameras", str(shapes / "transforms.json"), "--frame")
-    for frame in ("images/a.png", "a.png", "a", "0"):
-        posed = render(shapes, source, tmp_path / "b.png", *cameras, frame)
-        assert posed.shape == (30, 40, 3)
-        assert np.abs(posed - plain).mean() < 1
+    posed = render(shapes, source, tmp_path / "b.png", *cameras, "a")
+    assert posed.shape == (30, 40, 3)
+    assert np.abs(posed - plain).mean() < 1
     assert render(shapes, source, tmp_path / "b.png", *cameras, "b").shape == (36, 48, 3)
     assert render(shapes, source, tmp_path / "b.png", *cameras, "b", "--size", "16").shape == (12, 16, 3)
 
@@ -351,10 +329,9 @@ def test_posed_cameras_are_in_input_coordinates(shapes, tmp_path, source):
 def test_frames_are_chosen_by_name_or_index():
     camera = VIEWS["whole"]
     named = [("left/1.png", camera), ("left/0.png", camera), ("right/0.png", camera), ("extra", camera)]
-    for frame, name in (("left/0.png", "left/0.png"), ("extra", "extra"), ("1.png", "left/1.png"), ("3", "extra")):
-        assert choose_frame("c.json", named, frame)[0] == name
-    assert choose_frame("c.json", named, "1")[0] == "left/1.png"  # a name comes before an index
-    assert choose_frame("c.json", named, "0")[0] == "left/1.png"  # two are called so: the index decides
+    chosen = {"left/0.png": "left/0.png", "extra": "extra", "1.png": "left/1.png", "3": "extra"}
+    chosen |= {"1": "left/1.png", "0": "left/1.png"}  # a name comes before an index, but two end in 0
+    assert {frame: choose_frame("c.json", named, frame)[0] for frame in chosen} == chosen
     for frame in ("0.png", "4", "-1", "absent"):
         with pytest.raises(InputError, match="none, or more than one"):
             choose_frame("c.json", named, frame)
@@ -371,19 +348,12 @@ def test_clouds_are_drawn_as_discs_without_gaps(shapes, tmp_path):
 
 def test_turntables_have_the_frames_asked_for_and_one_scale_of_colours(shapes, tmp_path):
     arguments = ("--frames", "5", "--fps", "10", "--samples", "1", "--shading", "depth")
-    film = tmp_path / "a.gif"
-    assert main(["render", str(shapes / "plain.obj"), "-o", str(film), "--size", "48", *arguments]) == 0
-    frames = iio.imread(film, plugin="pillow", mode="RGB").astype(float)
+    frames = render(shapes, "blob.safetensors", tmp_path / "a.gif", "--size", "48", *arguments)
     assert len(frames) == 5
     legends = frames[:, 48:]
     assert legends.shape[1] > 0
     assert np.abs(legends - legends[0]).mean() < 1
     assert all(np.abs(frames[k, :48] - frames[0, :48]).mean() > 2 for k in range(1, 5))
-    assert (
-        main(["render", str(shapes / "blob.safetensors"), "-o", str(tmp_path / "a.mp4"), *arguments, "--size", "32"])
-        == 0
-    )
-    assert len(read_mp4(tmp_path / "a.mp4")) == 5
 
 
 def test_a_film_goes_through_posed_cameras(shapes, tmp_path):
@@ -391,19 +361,18 @@ def test_a_film_goes_through_posed_cameras(shapes, tmp_path):
     camera = orbit(SIMILARITY.to_input(open_subject(shapes / "unit.safetensors").outline()), width=32, height=32)
     write_transforms(shapes / "even.json", {"a": camera, "b": camera, "c": camera})
     assert main(["render", str(shapes / "plain.obj"), "-o", str(tmp_path / "a.mp4"), *cameras]) == 0
-    assert len(read_mp4(tmp_path / "a.mp4")) == 3
+    assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
 
 
-def test_an_interruption_leaves_what_was_there(shapes, tmp_path):
+@pytest.mark.parametrize("name", ["a.png", "a.gif"])
+def test_an_interruption_leaves_what_was_there(shapes, tmp_path, name):
     def stop(_done: int, _total: int) -> None:
         raise KeyboardInterrupt
 
-    for name in ("a.png", "a.gif"):
-        (tmp_path / name).write_text("old")
-        with pytest.raises(KeyboardInterrupt):
-            render_run(shapes / "blob.safetensors", tmp_path / name, RenderOptions(size=(8,), frames=3), progress=stop)
-        assert (tmp_path / name).read_text() == "old"
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.gif", "a.png"]
+    (tmp_path / name).write_text("old")
+    with pytest.raises(KeyboardInterrupt):
+        render_run(shapes / "blob.safetensors", tmp_path / name, RenderOptions(size=(8,), frames=3), progress=stop)
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {name: "old"}
 
 
 def test_it_says_when_nothing_is_in_view(shapes, tmp_path, capsys):
@@ -444,15 +413,8 @@ def test_it_says_when_nothing_is_in_view(shapes, tmp_path, capsys):
 def test_mistakes_are_one_line_and_leave_nothing(shapes, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(shapes)
     before = sorted(shapes.iterdir())
-    assert main(["render", *arguments.split()]) == 2
-    said = capsys.readouterr()
-    assert message in said.err
-    assert said.err.count("\n") == 1
-    assert not said.out
+    assert message in fails(capsys, f"render {arguments}")
     assert sorted(shapes.iterdir()) == before
-
-
-# --- the colour bar ------------------------------------------------------------------------------------
 
 
 def test_a_colour_bar_has_the_colours_in_order_and_ticks_at_round_numbers():

@@ -28,16 +28,6 @@ def drawn(image: np.ndarray) -> np.ndarray:
     return (image < 250).any(axis=2)
 
 
-def test_a_sphere_is_a_disc_of_the_right_size_without_holes():
-    seen = drawn(picture_of(sphere(), from_front(4, fov=60, size=(200, 200))))
-    # The outline of a unit sphere from distance 4 is at slope 1 / √(4² − 1); the image's edge is at slope tan 30°.
-    radius = 100 * (1 / np.sqrt(15)) / np.tan(np.radians(30))
-    assert seen.sum() == pytest.approx(np.pi * radius**2, rel=0.02)
-    rows, columns = np.mgrid[:200, :200] - 99.5
-    assert seen[np.hypot(rows, columns) < radius - 1.5].all()
-    assert not seen[np.hypot(rows, columns) > radius + 1.5].any()
-
-
 def test_pixels_see_a_tilted_square_where_their_rays_meet_it():
     normal = np.array([0.6, 0.0, 0.8])
     vertices = SQUARE @ np.array([[0.8, 0, -0.6], [0, 1, 0], [0.6, 0, 0.8]])
@@ -76,7 +66,6 @@ def test_the_nearer_of_two_squares_hides_the_other():
         image = picture_of(Mesh(vertices, order, colors=colors), camera).astype(int)
         assert image[50, 50, 2] > image[50, 50, 0] + 100
         assert image[70, 70, 0] > image[70, 70, 2] + 100
-        assert (image[2, 2] == 255).all()
 
 
 def test_back_faces_show_as_such():
@@ -90,8 +79,7 @@ def test_back_faces_show_as_such():
 
 
 def test_cutting_triangles_keeps_their_area_in_front_and_closes_up():
-    generator = np.random.default_rng(2)
-    vertices = generator.uniform(-1, 1, (90, 3))
+    vertices = np.random.default_rng(2).uniform(-1, 1, (90, 3))
     faces = np.arange(90).reshape(30, 3)
     height = vertices[:, 2] - 0.1
     cut = clip(height, faces)
@@ -200,10 +188,6 @@ def test_a_cloud_without_normals_is_darker_where_it_is_further():
 
 def test_pictures_of_the_same_thing_far_from_the_origin_are_the_same():
     ball, home = sphere(), np.array([5e5, 5.4e6, 300])
-    camera = orbit(ball.vertices, width=48, height=48)
-    far = Mesh(ball.vertices + home, ball.faces)
-    np.testing.assert_allclose(
-        picture_of(far, orbit(far.vertices, width=48, height=48)).astype(int),
-        picture_of(ball, camera).astype(int),
-        atol=1,
-    )
+    shapes = (ball, Mesh(ball.vertices + home, ball.faces))
+    here, there = (picture_of(shape, orbit(shape.vertices, width=48, height=48)).astype(int) for shape in shapes)
+    np.testing.assert_allclose(there, here, atol=1)
