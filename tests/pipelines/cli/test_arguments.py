@@ -38,15 +38,11 @@ def line_of(program: Program, name: str, chance: random.Random) -> list[str]:
     return words
 
 
-def has_input(program: Program, name: str) -> bool:
-    return any(not action.option_strings for action in flags_of(program, name)) and name not in NEED_NOTHING
-
-
 WITH_INPUT = [
     pytest.param(program, name, id=f"{program.name.split()[-1]} {name}")
     for program in (MPLICITS, BENCHMARKS)
     for name in program.commands
-    if has_input(program, name)
+    if name not in NEED_NOTHING and not all(action.option_strings for action in flags_of(program, name))
 ]
 
 

@@ -25,21 +25,17 @@ def test_the_picture_grows_level_by_level(
 ) -> None:
     """It is in its place, and its path said, when a level is finished and the next one has not begun."""
     cloud = sample_sphere(500, radius=3.0)
-    write_cloud_ply(
-        tmp_path / "ball.ply", PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype("f4") / 3)
-    )
+    colored = PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype("f4") / 3)
+    write_cloud_ply(tmp_path / "ball.ply", colored)
     monkeypatch.setattr(module, "TILE", (24, 32))
-    there = []
-    written = module.write_picture
+    there, written, out = [], module.write_picture, tmp_path / "new" / "demo"
 
     def write(path: Path, image: np.ndarray) -> None:
         written(path, image)
-        run = tmp_path / "new" / "demo" / "run"
-        there.append((iio.imread(path).shape[1], (run / "resume.safetensors").exists()))
+        there.append((iio.imread(path).shape[1], (out / "run" / "resume.safetensors").exists()))
 
     monkeypatch.setattr(module, "write_picture", write)
-    out = tmp_path / "new" / "demo"
-    assert main(["demo", str(tmp_path / "ball.ply"), "-o", str(out), "--resolution", "24", *SMALL.split()]) == 0
+    assert main(f"demo {tmp_path}/ball.ply -o {out} --resolution 24 {SMALL}".split()) == 0
     widths, unfinished = zip(*there, strict=True)
     assert widths == tuple(sorted(set(widths)))  # cloud and level 0; level 1 beside them; the mesh
     assert unfinished == (True, True, False)
@@ -54,7 +50,6 @@ def test_errors_are_those_of_closed_forms() -> None:
     """Of the statue itself they are 0, and of points beside it their distance."""
     statue = Statue()
     exact = sample_surface(statue, 5000)
-    assert exact.normals is not None
     off = 5e-4
     points = STATUE_PLACEMENT.to_input(exact.points + off * exact.normals.astype(np.float64))
     scan = replace(exact, points=points, normals=None)

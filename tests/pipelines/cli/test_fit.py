@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from evolutions import fails
 from mplicits.datasets import DepthCamera, PointCloud, read_cloud, write_cloud_ply
 from mplicits.neural_fields import Mesh
 from mplicits.pipelines.cli.entry import main
@@ -21,8 +22,7 @@ from mplicits.pipelines.training.settings import TextureConfig
 from scipy.spatial import KDTree
 
 CENTER = np.array([3.0, -1.0, 10.0])
-SMALL = ["--widths", "16", "--depths", "1", "--omegas", "5", "--steps", "100", "--learning-rates", "1e-2"]
-SMALL += ["--batch", "256", "--samples", "2000"]
+SMALL = "--widths 16 --depths 1 --omegas 5 --steps 100 --learning-rates 1e-2 --batch 256 --samples 2000"
 LENS = DepthCamera(96, 72, 90.0, 92.0, 46.5, 36.5)
 
 
@@ -55,13 +55,12 @@ def cloud(tmp_path: Path) -> Path:
 
 
 def run_fit(*words: object) -> int:
-    return main(["fit", *map(str, words), *SMALL, "--quiet"])
+    return main(["fit", *map(str, words), *SMALL.split(), "--quiet"])
 
 
 def check_colours(mesh: Mesh) -> None:
     out = (mesh.vertices - CENTER) / 2
     assert np.abs(np.linalg.norm(out, axis=1) - 1).mean() < 0.05
-    assert mesh.colors is not None
     assert np.abs(mesh.colors - painted(out)).mean() < 0.03
 
 
@@ -75,19 +74,7 @@ def test_a_coloured_cloud_becomes_a_coloured_mesh(cloud: Path, tmp_path: Path, s
     assert record["finished"]
     assert record["texture"]["finished"]
     assert record["texture"]["config"]["seed"] == 3
-    assert sorted(file.name for file in run.iterdir() if file.name != "run.lock") == sorted(
-        ["field.safetensors", "run.json", "support.safetensors", "texture.safetensors", mesh.name]
-    )
-
-
-def test_the_command_says_what_it_made(cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fit", str(cloud), "-o", str(tmp_path / "run"), "--mesh", str(tmp_path / "m.ply"), *SMALL]) == 0
-    printed = capsys.readouterr()
-    assert "texture.safetensors: (16, 2), " in printed.out
-    assert "vertices" in printed.out.splitlines()[-1]
-    assert "with colours" in printed.out.splitlines()[-1]
-    assert "next: " not in printed.out
-    assert "texture: 150 steps" in printed.err
+    assert not (run / "resume.safetensors").exists()
 
 
 @pytest.mark.parametrize("why", ["the cloud has none", "--no-colors", "STL holds none"])
@@ -116,9 +103,6 @@ def test_the_texture_of_a_mesh_is_taken(tmp_path: Path) -> None:
     assert np.abs(colors - (0, 1, 0)).max() < 0.05
 
 
-# --- depth maps --------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def frame(tmp_path: Path) -> list[object]:
     """The lower part of a ball, seen from below: red left of the axis, blue right of it."""
@@ -143,7 +127,6 @@ def test_a_depth_map_becomes_a_trimmed_coloured_mesh(
     mesh, cloud = read_surface(tmp_path / "mesh.ply"), read_cloud(tmp_path / "run" / "cloud.ply")
     assert KDTree(cloud.points).query(mesh.vertices)[0].max() < 1.05 * trim  # which was printed with two digits
     assert mesh.vertices[:, 2].max() < 3  # the other half of the ball was not seen
-    assert mesh.colors is not None
     left, right = mesh.vertices[:, 0] < -0.1, mesh.vertices[:, 0] > 0.1
     assert min(left.sum(), right.sum()) > 100
     assert np.abs(mesh.colors[left] - (1, 0, 0)).mean() < 0.1
@@ -153,9 +136,6 @@ def test_a_depth_map_becomes_a_trimmed_coloured_mesh(
 def test_a_depth_map_without_a_picture_gives_a_bare_mesh(frame: list[object], tmp_path: Path) -> None:
     assert run_fit(*frame[:3], "-o", tmp_path / "run", "--mesh", tmp_path / "mesh.ply") == 0
     assert read_surface(tmp_path / "mesh.ply").colors is None
-
-
-# --- interruptions -----------------------------------------------------------------------------------
 
 
 def interrupt_at(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,7 +162,7 @@ def test_an_interrupted_command_is_continued_as_it_says(
     source = [cloud] if kind == "cloud" else frame
     with monkeypatch.context() as patch:
         interrupt_at(stage, patch)
-        words = ["fit", *map(str, source), "-o", str(run), "--mesh", str(mesh), *SMALL]
+        words = ["fit", *map(str, source), "-o", str(run), "--mesh", str(mesh), *SMALL.split()]
         assert main(words) == 130
     assert not mesh.exists()
     said = capsys.readouterr().err.splitlines()[-1]
@@ -215,9 +195,6 @@ def test_a_finished_run_only_lacks_its_mesh(cloud: Path, tmp_path: Path, capsys:
     assert (run / "texture.safetensors").read_bytes() == before
 
 
-# --- mistakes ----------------------------------------------------------------------------------------
-
-
 def test_mistakes_are_one_line_before_any_work(
     cloud: Path, frame: list[object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -225,27 +202,21 @@ def test_mistakes_are_one_line_before_any_work(
     broken = tmp_path / "broken.obj"
     broken.write_text("mtllib none.mtl\n" + "".join(f"v {i} {i * i} 0\n" for i in range(12)) + "usemtl a\nf 1 2 3\n")
     for words, message in (
-        ((cloud, "--mesh", "mesh.foo"), "mesh.foo: unknown mesh format '.foo'"),
-        ((cloud, "--mesh", broken / "mesh.ply"), "broken.obj is no folder; choose another place"),
-        ((cloud, "--mesh", tmp_path), "unknown mesh format"),
-        ((cloud, "--mesh", cloud), "is the cloud that is fitted; name another file"),
-        ((cloud, "--no-colors"), "--no-colors: is about --mesh FILE"),
-        ((*frame, "--mesh", run / "cloud.ply"), "is the cloud that is fitted; name another file"),
-        ((tmp_path / "none.ply", "--mesh", "mesh.ply"), "no such file"),
-        ((broken, "--mesh", "mesh.ply"), "(or leave the colours out: --no-colors)"),
+        (f"{cloud} --mesh mesh.foo", "mesh.foo: unknown mesh format"),
+        (f"{cloud} --mesh {broken}/mesh.ply", "broken.obj is no folder"),
+        (f"{cloud} --mesh {tmp_path}", "unknown mesh format"),
+        (f"{cloud} --mesh {cloud}", "is the cloud that is fitted"),
+        (f"{cloud} --no-colors", "--no-colors: is about --mesh FILE"),
+        (f"{' '.join(map(str, frame))} --mesh {run}/cloud.ply", "is the cloud that is fitted"),
+        (f"{tmp_path}/none.ply --mesh mesh.ply", "no such file"),
+        (f"{broken} --mesh mesh.ply", "--no-colors"),
     ):
-        capsys.readouterr()
-        assert run_fit(*words, "-o", run) == 2
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1
-        assert message in lines[0]
+        assert message in fails(capsys, f"fit {words} -o {run}")
         assert not run.exists()
     assert cloud.read_bytes() == before
 
 
 def test_stl_far_away_is_refused_before_the_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    far = ball()
-    np.savetxt(tmp_path / "far.xyz", far.points + np.array([500_000, 5_600_000, 0]))
-    assert run_fit(tmp_path / "far.xyz", "-o", tmp_path / "run", "--mesh", tmp_path / "m.stl") == 2
-    assert "STL keeps seven digits" in capsys.readouterr().err
+    np.savetxt(tmp_path / "far.xyz", ball().points + np.array([500_000, 5_600_000, 0]))
+    assert "STL keeps" in fails(capsys, f"fit {tmp_path}/far.xyz -o {tmp_path}/run --mesh {tmp_path}/m.stl")
     assert not (tmp_path / "run").exists()

@@ -1,17 +1,16 @@
 """Clouds and meshes as shapes: each is fitted once, and poses of one mesh are landmarks of each other."""
 
-import dataclasses
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from evolutions import QUICK, fails, few_points
+from evolutions import QUICK, fails
 from mplicits.neural_fields import Similarity, Sphere, save_field
 from mplicits.neural_fields.backend.files import write_json
 from mplicits.pipelines.cli.entry import main
-from mplicits.pipelines.evolve import deform, scans
+from mplicits.pipelines.evolve import scans
 from mplicits.pipelines.evolve.scans import fits_beside, fitted_scans, scans_among
 from mplicits.pipelines.evolve.shapes import read_landmarks
 from mplicits.pipelines.surface.surface import read_surface
@@ -85,15 +84,7 @@ def test_other_faces_and_clouds_are_no_poses(poses: list[str], tmp_path: Path, m
 
 
 @pytest.mark.slow
-def test_a_series_of_scans_on_the_command_line(
-    poses: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-):
-    few_points(monkeypatch)
-    monkeypatch.setattr(
-        deform,
-        "MOTION",
-        dataclasses.replace(deform.MOTION, pool=500, matched=100, guided=32, loose=32, regular=64, steps=2),
-    )
+def test_a_series_of_scans_on_the_command_line(poses: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     fits = tmp_path / "fits.yaml"
     fits.write_text(
         "widths: [16]\ndepths: [1]\nomegas: [4]\nsteps: [30]\nlearning_rates: [1.0e-2]\nbatch: 256\nsamples: 1000\n"

@@ -11,20 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from evolutions import BRIEF, QUICK, ball, fails, few_points
-from mplicits.neural_fields import (
-    InputError,
-    Moving,
-    MultiscaleSDF,
-    Plane,
-    RigidMotion,
-    Similarity,
-    Siren,
-    SpaceTimeSDF,
-    Sphere,
-    at_time,
-    load_field,
-)
-from mplicits.neural_fields.fields.primitives import Evaluated
+from mplicits.neural_fields import InputError, Moving, MultiscaleSDF, RigidMotion, Siren, Sphere, at_time, load_field
 from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve.checks import check_evolution, slope_figures
@@ -33,18 +20,12 @@ from mplicits.pipelines.evolve.samples import band_points
 from mplicits.pipelines.evolve.train import evolve
 from mplicits.pipelines.training.settings import EvolveConfig, load_config, preset_names
 from mplicits.pipelines.training.trainer import Interrupted, Progress
-from torch import Tensor
 
 TRAVEL = RigidMotion(velocity=(0.4, 0.0, 0.0))
 FLAGS = (
     "--widths 16 --depths 1 --omegas 5 --steps 5 --learning-rates 1e-3 --data-weights 100 --start-steps 5 --batch 64 "
     "--samples 500 --frames 2 --resolution 16 --quiet"
 )
-
-
-@pytest.fixture(autouse=True)
-def _few_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    few_points(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +35,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         few_points(patch)
         evolve(BRIEF, out=directory)
     return directory
-
-
-def tensors(directory: Path) -> dict[str, Tensor]:
-    return dict(load_field(directory / "field.safetensors").field.state_dict())
 
 
 def interrupt(stage: str, step: int) -> Callable[[Progress], None]:
@@ -70,9 +47,6 @@ def interrupt(stage: str, step: int) -> Callable[[Progress], None]:
             os.kill(os.getpid(), signal.SIGINT)
 
     return report
-
-
-# Training
 
 
 def test_a_travelling_sphere_is_learnt() -> None:
@@ -112,9 +86,6 @@ def test_points_of_a_residual_band_lie_in_it() -> None:
     assert bool(field.in_band(points, level=1).all())
 
 
-# Checks
-
-
 def test_the_checks_of_an_exact_field() -> None:
     truth = ShrinkingSphere(radius=0.8, alpha=0.12)
     unit = torch.nn.functional.normalize(torch.randn(4000, 3), dim=1)
@@ -132,50 +103,28 @@ def test_the_checks_of_an_exact_field() -> None:
 
 
 def test_empty_frames_and_missed_ends_are_warned_about() -> None:
-    class Nothing(Plane):
-        """Positive in the whole cube from t = 0 on."""
-
-        def __init__(self) -> None:
-            super().__init__(offset=-5.0)
-            self.in_dim = 4
-
-        def _evaluate(self, x: Tensor) -> Evaluated:
-            value, gradient = super()._evaluate(x[..., :3])
-            return value, lambda: torch.nn.functional.pad(gradient(), (0, 1))
-
+    nothing = Moving(Sphere(radius=0.1, center=(9.0, 0.0, 0.0)), TRAVEL)
     points = torch.rand(100, 3)
-    checks = check_evolution(Nothing(), [End("ball", 0.0, points, points)], frames=4, resolution=16)
+    checks = check_evolution(nothing, [End("ball", 0.0, points, points)], frames=4, resolution=16)
     assert [frame["components"] for frame in checks["frames"]] == [0] * 4
     empty, missed = checks["warnings"]
     assert empty.startswith("no surface at 4 of 4 times, the first at t = 0")
     assert missed.startswith("ball is not met at t = 0 (nothing is there)")
     others = torch.rand(100, 3)
-    wrong = check_evolution(
-        ShrinkingSphere(radius=0.8, alpha=0.1), [End("ball", 0.0, 0.5 * points, 0.5 * others)], frames=2, resolution=24
-    )
+    end = End("ball", 0.0, 0.5 * points, 0.5 * others)
+    wrong = check_evolution(ShrinkingSphere(radius=0.8, alpha=0.1), [end], frames=2, resolution=24)
     assert "times its floor" in wrong["warnings"][0]
 
 
-# Runs
-
-
 def test_a_run_holds_its_field_and_its_record(finished: Path) -> None:
-    field, similarity, metadata = load_field(finished / "field.safetensors")
-    assert isinstance(field, SpaceTimeSDF)
+    field, _, metadata = load_field(finished / "field.safetensors")
     assert field.num_levels == 2
-    assert similarity == Similarity.identity()
-    assert sorted(path.name for path in finished.iterdir() if path.name != "run.lock") == [
-        "field.safetensors",
-        "run.json",
-    ]
+    assert {path.name for path in finished.iterdir()} == {"field.safetensors", "run.json", "run.lock"}
     record = json.loads((finished / "run.json").read_text())
     assert record["finished"]
-    assert record["kind"] == "transport"
-    assert record["shapes"] == ["sphere:0.4@-0.2,0,0"]
     assert record["placements"][0]["shift"] == [-0.2, 0.0, 0.0]
     assert len(record["checks"]["frames"]) == 3
     assert [end["time"] for end in record["checks"]["ends"]] == [0.0, 1.0]
-    assert "torch" in record["environment"]["versions"]
     assert load_config(EvolveConfig, None, record["config"]) == BRIEF
     assert metadata["run"]["kind"] == "transport"
 
@@ -192,9 +141,8 @@ def test_an_interrupted_run_resumes_to_the_same_field(finished: Path, tmp_path: 
         assert not json.loads((directory / "run.json").read_text())["finished"]
         assert load_field(directory / "field.safetensors").field.num_levels == 1 + (stage == "level 1")
         evolve(EvolveConfig(), out=directory, resume=True)
-    expected, found = tensors(finished), tensors(directory)
-    assert expected.keys() == found.keys()
-    assert all(torch.equal(found[name], tensor) for name, tensor in expected.items())
+    expected, found = (load_field(run / "field.safetensors").field.state_dict() for run in (finished, directory))
+    torch.testing.assert_close(found, expected, rtol=0, atol=0)
 
 
 def test_other_shapes_cannot_be_resumed(tmp_path: Path) -> None:
@@ -226,8 +174,7 @@ def test_a_morph_of_two_runs_on_the_command_line(tmp_path: Path, capsys: pytest.
     record = json.loads((run / "run.json").read_text())
     assert record["align"] == "center"
     assert record["similarity"] == {"center": [5.0, 0.0, 0.0], "scale": 2.0}
-    message = fails(capsys, f"evolve {files[0]} {files[1]} -o {run} {FLAGS}")
-    assert "--force overwrites it" in message
+    assert "--force" in fails(capsys, f"evolve {files[0]} {files[1]} -o {run} {FLAGS}")
     assert "nothing to resume" in fails(capsys, f"evolve -o {run} --resume")
 
 
@@ -262,14 +209,6 @@ def test_bad_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], argum
 
 def test_the_bundled_presets_are_valid() -> None:
     assert all(load_config(EvolveConfig, name) for name in preset_names("evolve"))
-    assert load_config(EvolveConfig, "default") == EvolveConfig()
-
-
-def test_stages_are_reported_in_order() -> None:
-    said: list[Progress] = []
-    evolve(BRIEF, progress=said.append)
-    stages = ["shapes", "known samples", "first shape", "level 0", "level 1", "checks"]
-    assert list(dict.fromkeys(progress.stage for progress in said)) == stages
 
 
 def test_a_budget_that_is_too_small_leaves_out_levels_and_samples(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from mplicits.pipelines.web.export import BITS
 from mplicits.pipelines.web.payload import rounded_field
-from pages import bumpy, until
+from pages import bumpy, open_page, until
 
 pytest.importorskip("selenium")
 
@@ -27,7 +27,7 @@ def resting(browser, page):
     """A page of its own, seen along −x, at rest; higher than others, so that the panel leaves room for the shape."""
     before = browser.get_window_size()
     browser.set_window_size(500, 500)
-    browser.get(f"{page.as_uri()}?pixel=16&camera=90,0&webgl")
+    open_page(browser, page.as_uri(), "camera=90,0")
     rest(browser)
     yield browser
     browser.set_window_size(before["width"], before["height"])
@@ -174,14 +174,10 @@ def test_pictures_and_films_are_saved(resting, tmp_path):
 
 
 def test_paper_is_as_bright_as_the_system_and_can_be_changed(browser, page):
-    wish = {"features": [{"name": "prefers-color-scheme", "value": "light"}]}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", wish)
-    browser.get(f"{page.as_uri()}?pixel=16&webgl")
-    until(lambda: browser.execute_script("return !!window.mplicits"))
-    stage = browser.find_element(By.ID, "stage")
-    assert stage.get_attribute("data-theme") == "light"
-    browser.execute_cdp_cmd(
-        "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
-    )
-    until(lambda: stage.get_attribute("data-theme") == "dark")
+    open_page(browser, page.as_uri())
+    for theme in ("light", "dark"):
+        wish = {"features": [{"name": "prefers-color-scheme", "value": theme}]}
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", wish)
+        stage = browser.find_element(By.ID, "stage")
+        until(lambda theme=theme, stage=stage: stage.get_attribute("data-theme") == theme)
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
