@@ -46,7 +46,7 @@ WITH_INPUT = [
 ]
 
 
-def one_line_and_2(program: Program, line: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+def one_line_and_2(program: Program, line: list[str], capfd) -> None:
     code = program.main(line)
     said = capfd.readouterr()
     assert (code, len(said.err.splitlines())) == (2, 1), (line, code, said.err[-2000:])
@@ -55,9 +55,7 @@ def one_line_and_2(program: Program, line: list[str], capfd: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(("program", "name"), WITH_INPUT)
-def test_junk_is_refused_in_one_line(
-    program: Program, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_junk_is_refused_in_one_line(program: Program, name: str, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     chance = random.Random(name if program is MPLICITS else f"bench {name}")
     for _ in range(15):
@@ -68,9 +66,7 @@ def test_junk_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize(("program", "name"), WITH_INPUT)
-def test_a_folder_that_one_may_not_enter_is_named(
-    program: Program, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_that_one_may_not_enter_is_named(program: Program, name: str, tmp_path, monkeypatch, capfd):
     """As for a user who is not root: every look into it is refused."""
     closed = tmp_path / "closed"
     closed.mkdir()

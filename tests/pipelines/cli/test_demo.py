@@ -20,9 +20,7 @@ def figures(text: str) -> dict[str, list[float]]:
     return {name: list(map(float, numbers)) for name, *numbers in rows}
 
 
-def test_the_picture_grows_level_by_level(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_picture_grows_level_by_level(tmp_path, monkeypatch, capsys):
     """It is in its place, and its path said, when a level is finished and the next one has not begun."""
     cloud = sample_sphere(500, radius=3.0)
     colored = PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype("f4") / 3)
@@ -46,7 +44,7 @@ def test_the_picture_grows_level_by_level(
 
 
 @pytest.mark.slow
-def test_errors_are_those_of_closed_forms() -> None:
+def test_errors_are_those_of_closed_forms():
     """Of the statue itself they are 0, and of points beside it their distance."""
     statue = Statue()
     exact = sample_surface(statue, 5000)
@@ -65,7 +63,7 @@ def test_errors_are_those_of_closed_forms() -> None:
 
 
 @pytest.mark.slow
-def test_every_level_is_nearer_to_the_statue(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_level_is_nearer_to_the_statue(tmp_path, capsys):
     """What the demo is there to show, at the scan's points."""
     assert main(["demo", "-o", str(tmp_path / "demo")]) == 0
     table = figures(capsys.readouterr().out)

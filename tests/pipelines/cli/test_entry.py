@@ -25,6 +25,9 @@ from mplicits.pipelines.surface.surface import read_surface
 SMALL = "--widths 16 16 --depths 1 1 --omegas 5 8 --steps 300 100 --learning-rates 5e-3 1e-3 --batch 256 --samples 2000"
 
 
+IMPORT_MAIN = "import sys; from mplicits.pipelines.cli.entry import main"
+
+
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory) -> Path:
     """A sphere of radius 3 around (100, 0, 0), as text with normals."""
@@ -78,11 +81,8 @@ def test_help_of_each_command_has_examples_that_parse(capsys, name):
 
 
 def test_neither_help_nor_mistakes_wait_for_torch():
-    program = (
-        "import sys; from mplicits.pipelines.cli.entry import main; "
-        "main(['--help']); main(['fit', '--help']); main(['fti']); main(['fit', 'a', '--ouput', 'b']); "
-        "sys.exit('torch' in sys.modules)"
-    )
+    lines = [["--help"], ["fit", "--help"], ["fti"], ["fit", "a", "--ouput", "b"]]
+    program = f"{IMPORT_MAIN}; [main(line) for line in {lines}]; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, timeout=60)
 
 
@@ -131,10 +131,13 @@ def test_broken_clouds_are_one_line_and_leave_no_run_behind(capsys, tmp_path, na
 
 def test_foreign_and_damaged_fields_are_one_line(capsys, run, tmp_path):
     (tmp_path / "cut.safetensors").write_bytes((run / "field.safetensors").read_bytes()[:500])
-    for command in ("info", f"mesh -o {tmp_path}/mesh.ply"):
+    save_field(tmp_path / "far.safetensors", Sphere(center=(9.0, 0.0, 0.0)))
+    mesh = f"mesh -o {tmp_path}/mesh.ply"
+    for command in ("info", mesh):
         assert "cut.safetensors" in fails(capsys, f"{command} {tmp_path}/cut.safetensors")
         assert "not a run directory" in fails(capsys, f"{command} {tmp_path}")
         assert "no such run" in fails(capsys, f"{command} {tmp_path}/absent.safetensors")
+    assert "no surface" in fails(capsys, f"{mesh} {tmp_path}/far.safetensors")
     assert not (tmp_path / "mesh.ply").exists()
 
 
@@ -149,7 +152,7 @@ def test_a_run_is_not_overwritten_unless_told_to(capsys, cloud, run):
 def test_ctrl_c_leaves_a_run_that_resume_finishes(cloud, tmp_path):
     out = tmp_path / "run"
     slow = SMALL.replace("300", "100000").split()
-    program = "import sys; from mplicits.pipelines.cli.entry import main; sys.exit(main(sys.argv[1:]))"
+    program = f"{IMPORT_MAIN}; sys.exit(main(sys.argv[1:]))"
     arguments = [sys.executable, "-c", program, "fit", str(cloud), "-o", str(out)]
     process = subprocess.Popen([*arguments, *slow], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 600  # of a busy machine
@@ -209,9 +212,8 @@ def test_a_mesh_with_fewer_triangles_says_how_far_it_is_from_the_full_one(capsys
     text = said(capsys, f"mesh {run} -o {out} --resolution 48 --faces 500 --unit cm --json {figures}")
     cost = json.loads(figures.read_text())["decimation"]
     assert cost["faces"] == len(trimesh.load_mesh(out).faces) <= 500
-    assert f"{cost['faces_before']:,} → {cost['faces']:,} faces, at most {cost['largest']:.3g} cm" in text
+    assert f"at most {cost['largest']:.3g} cm" in text
     assert 0 < cost["mean"] < cost["largest"] < 1  # of a ball of radius 3
-    assert "still watertight" in text
     np.testing.assert_allclose(np.linalg.norm(read_cloud(out).normals, axis=1), 1, atol=1e-6)
     assert "--texture-faces" in fails(capsys, f"mesh {run} -o {tmp_path}/a.glb --texture 64 --faces 500")
     assert "--texture" in fails(capsys, f"mesh {run} -o {tmp_path}/a.glb --texture 64 --report")
@@ -251,12 +253,6 @@ def test_trimming_takes_the_points_from_the_fit_or_from_a_file(capsys, run, clou
     assert trimesh.load_mesh(out).area == pytest.approx(whole * 0.6, rel=0.2)
 
 
-def test_a_field_without_a_surface_says_so(capsys, tmp_path):
-    save_field(tmp_path / "far.safetensors", Sphere(center=(9.0, 0.0, 0.0)))
-    assert "no surface" in fails(capsys, f"mesh {tmp_path}/far.safetensors -o {tmp_path}/mesh.ply")
-    assert not (tmp_path / "mesh.ply").exists()
-
-
 def test_info_describes_runs_fields_meshes_and_clouds(capsys, run, cloud, box):
     for source, lines in (
         (run, ["MultiscaleSDF, 2 levels", r"\(16, 1\), ω₀ = 5", "δ = ", "finished"]),
@@ -278,7 +274,7 @@ def test_ctrl_c_ends_quietly(monkeypatch, capsys):
 
 
 def test_output_into_a_closed_pipe_is_no_traceback(box):
-    program = f"import sys; from mplicits.pipelines.cli.entry import main; sys.exit(main(['info', {str(box)!r}]))"
+    program = f"{IMPORT_MAIN}; sys.exit(main(['info', {str(box)!r}]))"
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdout.close()
     error = process.stderr.read()
@@ -322,10 +318,15 @@ def test_doctor_finds_nothing_wrong_here(capsys):
     assert "error" not in text.replace("errors", "")
 
 
+def finding_about(topic, folder) -> doctor.Finding:
+    (found,) = [finding for finding in doctor.examine(folder) if finding.topic == topic]
+    return found
+
+
 def test_doctor_says_that_nothing_is_kept_of_what_python_compiles(monkeypatch, tmp_path):
     monkeypatch.setattr(torch, "__file__", str(tmp_path / "it's" / "torch" / "__init__.py"))
     kept = Path(importlib.util.cache_from_source(torch.__file__))
-    (start,) = [finding for finding in doctor.examine(tmp_path) if finding.topic == "start"]
+    start = finding_about("start", tmp_path)
     assert start.level == "warning"
     kept.parent.mkdir(parents=True)
     Path(torch.__file__).touch()
@@ -333,14 +334,13 @@ def test_doctor_says_that_nothing_is_kept_of_what_python_compiles(monkeypatch, t
     assert words[0] == sys.executable  # another Python keeps other files
     subprocess.run(words, check=True)
     assert kept.exists()
-    (start,) = [finding for finding in doctor.examine(tmp_path) if finding.topic == "start"]
-    assert start.level == "ok"
+    assert finding_about("start", tmp_path).level == "ok"
 
 
 def test_doctor_says_who_evaluates(monkeypatch, tmp_path):
     for setting, level in (("off", "note"), ("on", "warning")):
         monkeypatch.setenv("MPLICITS_KERNELS", setting)
-        (kernels,) = [finding for finding in doctor.examine(tmp_path) if finding.topic == "kernels"]
+        kernels = finding_about("kernels", tmp_path)
         assert kernels.level == level
         assert "MPLICITS_KERNELS" in kernels.text
 
@@ -353,10 +353,7 @@ def test_doctor_knows_all_extras(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor.importlib.metadata, "requires", lambda name: [*project["dependencies"], *lines])
     monkeypatch.setattr(doctor, "_installed", lambda name: None)
     report = doctor.format_findings(doctor.examine(tmp_path))
-    for extra in ("las", "poisson", "texture"):
-        assert f"optional, not installed; pip install 'mplicits[{extra}]'" in report
-    assert "mplicits[dev]" not in report
-    assert "xatlas" in report
+    assert {"las", "poisson", "texture"} <= set(re.findall(r"mplicits\[(\w+)\]", report)) <= set(extras) - {"dev"}
 
 
 def test_doctor_tells_two_builds_of_torch_apart(monkeypatch, tmp_path):
@@ -365,14 +362,13 @@ def test_doctor_tells_two_builds_of_torch_apart(monkeypatch, tmp_path):
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(doctor, "_installed", {"torchvision": "0.28.0"}.get)
     package.write_text("raise RuntimeError('operator torchvision::nms does not exist')")
-    (found,) = doctor._torchvision()
-    assert (found.level, found.topic) == ("warning", "torchvision")
+    found = finding_about("torchvision", tmp_path)
+    assert found.level == "warning"
     assert f"does not work with torch {torch.__version__} (RuntimeError: operator torchvision::nms" in found.text
     package.write_text("")
-    (found,) = doctor._torchvision()
-    assert found.level == "ok"
+    assert finding_about("torchvision", tmp_path).level == "ok"
     monkeypatch.setattr(doctor, "_installed", lambda name: None)
-    assert doctor._torchvision() == []
+    assert "torchvision" not in {finding.topic for finding in doctor.examine(tmp_path)}
 
 
 def test_doctor_names_what_is_missing_and_what_clashes(monkeypatch, tmp_path):

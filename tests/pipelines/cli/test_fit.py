@@ -27,7 +27,7 @@ LENS = DepthCamera(96, 72, 90.0, 92.0, 46.5, 36.5)
 
 
 @pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
+def small(monkeypatch) -> None:
     """The default texture takes most of a minute."""
     small = TextureConfig(
         width=16, depth=2, omega=8.0, steps=150, learning_rate=1e-2, batch=256, band_batch=64, samples=4000
@@ -49,7 +49,7 @@ def ball(*, colors: bool = True) -> PointCloud:
 
 
 @pytest.fixture
-def cloud(tmp_path: Path) -> Path:
+def cloud(tmp_path) -> Path:
     write_cloud_ply(tmp_path / "ball.ply", ball())
     return tmp_path / "ball.ply"
 
@@ -65,7 +65,7 @@ def check_colours(mesh: Mesh) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
-def test_a_coloured_cloud_becomes_a_coloured_mesh(cloud: Path, tmp_path: Path, suffix: str) -> None:
+def test_a_coloured_cloud_becomes_a_coloured_mesh(cloud: Path, tmp_path, suffix: str):
     run = tmp_path / "run"
     mesh = run / f"mesh{suffix}"  # in the folder that the fit makes
     assert run_fit(cloud, "-o", run, "--mesh", mesh, "--seed", 3) == 0
@@ -77,18 +77,18 @@ def test_a_coloured_cloud_becomes_a_coloured_mesh(cloud: Path, tmp_path: Path, s
     assert not (run / "resume.safetensors").exists()
 
 
-@pytest.mark.parametrize("why", ["the cloud has none", "--no-colors", "STL holds none"])
-def test_no_texture_is_trained_where_no_colours_would_show(cloud: Path, tmp_path: Path, why: str) -> None:
-    words: list[object] = ["--no-colors"] if why == "--no-colors" else []
-    if why == "the cloud has none":
-        write_cloud_ply(cloud, ball(colors=False))
-    mesh = tmp_path / ("mesh.stl" if why == "STL holds none" else "mesh.ply")
-    assert run_fit(cloud, "-o", tmp_path / "run", "--mesh", mesh, *words) == 0
+@pytest.mark.parametrize(
+    ("flags", "suffix", "colors"), [((), "ply", False), (("--no-colors",), "ply", True), ((), "stl", True)]
+)
+def test_no_texture_is_trained_where_no_colours_would_show(tmp_path, flags, suffix, colors):
+    cloud, mesh = tmp_path / "ball.ply", tmp_path / f"mesh.{suffix}"
+    write_cloud_ply(cloud, ball(colors=colors))
+    assert run_fit(cloud, "-o", tmp_path / "run", "--mesh", mesh, *flags) == 0
     assert read_surface(mesh).colors is None
     assert not (tmp_path / "run" / "texture.safetensors").exists()
 
 
-def test_the_texture_of_a_mesh_is_taken(tmp_path: Path) -> None:
+def test_the_texture_of_a_mesh_is_taken(tmp_path):
     """Colours of an OBJ with an image are in the image, and none at the vertices that are fitted."""
     sphere = trimesh.creation.icosphere(3)
     cv2.imwrite(str(tmp_path / "green.png"), np.full((4, 4, 3), (0, 255, 0), np.uint8))
@@ -104,7 +104,7 @@ def test_the_texture_of_a_mesh_is_taken(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def frame(tmp_path: Path) -> list[object]:
+def frame(tmp_path) -> list[object]:
     """The lower part of a ball, seen from below: red left of the axis, blue right of it."""
     rays = LENS.rays().numpy()
     a, b = (rays**2).sum(axis=2), 3 * rays[..., 2]
@@ -119,9 +119,7 @@ def frame(tmp_path: Path) -> list[object]:
     return [tmp_path / "depth.png", "--intrinsics", tmp_path / "camera.json", "--color", tmp_path / "color.png"]
 
 
-def test_a_depth_map_becomes_a_trimmed_coloured_mesh(
-    frame: list[object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_depth_map_becomes_a_trimmed_coloured_mesh(frame: list[object], tmp_path, capsys):
     assert run_fit(*frame, "-o", tmp_path / "run", "--mesh", tmp_path / "mesh.ply") == 0
     trim = float(capsys.readouterr().out.rsplit("--trim-distance ", 1)[1].split(",")[0])
     mesh, cloud = read_surface(tmp_path / "mesh.ply"), read_cloud(tmp_path / "run" / "cloud.ply")
@@ -133,12 +131,12 @@ def test_a_depth_map_becomes_a_trimmed_coloured_mesh(
     assert np.abs(mesh.colors[right] - (0, 0, 1)).mean() < 0.1
 
 
-def test_a_depth_map_without_a_picture_gives_a_bare_mesh(frame: list[object], tmp_path: Path) -> None:
+def test_a_depth_map_without_a_picture_gives_a_bare_mesh(frame: list[object], tmp_path):
     assert run_fit(*frame[:3], "-o", tmp_path / "run", "--mesh", tmp_path / "mesh.ply") == 0
     assert read_surface(tmp_path / "mesh.ply").colors is None
 
 
-def interrupt_at(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def interrupt_at(stage: str, monkeypatch) -> None:
     """Press Ctrl-C at the first report of a stage that has begun."""
 
     def stop(self: Lines, progress: object, /) -> None:
@@ -149,15 +147,7 @@ def interrupt_at(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("kind", "stage"), [("cloud", "level 0"), ("cloud", "texture"), ("depth map", "texture")])
-def test_an_interrupted_command_is_continued_as_it_says(
-    cloud: Path,
-    frame: list[object],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    kind: str,
-    stage: str,
-) -> None:
+def test_an_interrupted_command_is_continued_as_it_says(cloud, frame, tmp_path, monkeypatch, capsys, kind, stage):
     run, mesh = tmp_path / "run", tmp_path / "mesh.ply"
     source = [cloud] if kind == "cloud" else frame
     with monkeypatch.context() as patch:
@@ -182,7 +172,7 @@ def test_an_interrupted_command_is_continued_as_it_says(
     assert (tmp_path / "whole.ply").read_bytes() == mesh.read_bytes()
 
 
-def test_a_finished_run_only_lacks_its_mesh(cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_finished_run_only_lacks_its_mesh(cloud: Path, tmp_path, capsys):
     run, mesh = tmp_path / "run", tmp_path / "mesh.ply"
     assert run_fit(cloud, "-o", run) == 0
     resumed = ["fit", str(cloud), "-o", str(run), "--resume", "--quiet"]
@@ -195,9 +185,7 @@ def test_a_finished_run_only_lacks_its_mesh(cloud: Path, tmp_path: Path, capsys:
     assert (run / "texture.safetensors").read_bytes() == before
 
 
-def test_mistakes_are_one_line_before_any_work(
-    cloud: Path, frame: list[object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_one_line_before_any_work(cloud: Path, frame: list[object], tmp_path, capsys):
     run, before = tmp_path / "run", cloud.read_bytes()
     broken = tmp_path / "broken.obj"
     broken.write_text("mtllib none.mtl\n" + "".join(f"v {i} {i * i} 0\n" for i in range(12)) + "usemtl a\nf 1 2 3\n")
@@ -216,7 +204,7 @@ def test_mistakes_are_one_line_before_any_work(
     assert cloud.read_bytes() == before
 
 
-def test_stl_far_away_is_refused_before_the_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_stl_far_away_is_refused_before_the_fit(tmp_path, capsys):
     np.savetxt(tmp_path / "far.xyz", ball().points + np.array([500_000, 5_600_000, 0]))
     assert "STL keeps" in fails(capsys, f"fit {tmp_path}/far.xyz -o {tmp_path}/run --mesh {tmp_path}/m.stl")
     assert not (tmp_path / "run").exists()

@@ -33,7 +33,7 @@ THREE_VIEWS = "--views 3 --size 16 --samples 1"
 
 
 @pytest.fixture
-def finder(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+def finder(monkeypatch) -> list[dict[str, Any]]:
     """In COLMAP's place, a function that has the cameras."""
     calls: list[dict[str, Any]] = []
 
@@ -49,9 +49,7 @@ def finder(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     return calls
 
 
-def test_cameras_are_found_and_what_is_doubtful_is_said(
-    tmp_path: Path, finder: list[dict[str, Any]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_cameras_are_found_and_what_is_doubtful_is_said(tmp_path, finder: list[dict[str, Any]], capsys):
     project, said = tmp_path / "project", tmp_path / "said.json"
     assert main(f"find-cameras photos -o {project} --frames 7 --lens each --json {said} --quiet".split()) == 0
     out, err = capsys.readouterr()
@@ -62,9 +60,7 @@ def test_cameras_are_found_and_what_is_doubtful_is_said(
     assert json.loads(said.read_text())["left_out"] == ["4.png"]
 
 
-def test_points_are_found_and_few_are_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_points_are_found_and_few_are_said(tmp_path, monkeypatch, capsys):
     def find(source: Path, project: Path, *, report: Any) -> FoundPoints:
         report(FEATURES, 1, 4)
         return FoundPoints(Path(project), 4, 40, 0.5)
@@ -81,9 +77,7 @@ def test_points_are_found_and_few_are_said(
     assert "none: no such file" in fails(capsys, f"find-points {tmp_path}/none -o {project} --quiet")
 
 
-def test_a_reconstruction_begins_with_its_cameras(
-    tmp_path: Path, finder: list[dict[str, Any]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_reconstruction_begins_with_its_cameras(tmp_path, finder: list[dict[str, Any]], capsys):
     run = tmp_path / "run"
     assert main(f"reconstruct film.mp4 -o {run} --poses colmap {TINY}".split()) == 0
     assert [(str(call["source"]), call["project"]) for call in finder] == [("film.mp4", tmp_path / "run-cameras")]
@@ -91,9 +85,7 @@ def test_a_reconstruction_begins_with_its_cameras(
     assert json.loads((run / "run.json").read_text())["data"].startswith(str(tmp_path / "run-cameras"))
 
 
-def test_steps_that_could_not_be_recorded_are_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_steps_that_could_not_be_recorded_are_said(tmp_path, monkeypatch, capsys):
     class Refusing(Recorder):
         def record(self, work: Work) -> NoReturn:
             raise RuntimeError("no memory for graphs")
@@ -112,9 +104,7 @@ def test_steps_that_could_not_be_recorded_are_said(
     assert record["replayed"] == {"recorded": 0, "not_taken": 0, "refused": "no memory for graphs"}
 
 
-def test_an_interruption_of_the_search_says_how_to_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interruption_of_the_search_says_how_to_go_on(tmp_path, monkeypatch, capsys):
     def interrupted(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
@@ -124,7 +114,7 @@ def test_an_interruption_of_the_search_says_how_to_go_on(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_scene_has_the_fault_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scene_has_the_fault_that_is_asked_for(tmp_path, capsys):
     assert main(f"scene figure -o {tmp_path}/right {THREE_VIEWS}".split()) == 0
     assert main(f"scene figure -o {tmp_path}/wrong {THREE_VIEWS} --fault mirrored".split()) == 0
     right, wrong = (cv2.imread(str(tmp_path / name / "image" / "000.png")) for name in ("right", "wrong"))
@@ -132,7 +122,7 @@ def test_a_scene_has_the_fault_that_is_asked_for(tmp_path: Path, capsys: pytest.
     assert "--views 3 or more" in fails(capsys, f"scene figure -o {tmp_path}/few --views 2 --fault image")
 
 
-def test_a_mesh_is_photographed_where_it_is(tmp_path: Path) -> None:
+def test_a_mesh_is_photographed_where_it_is(tmp_path):
     ball = tmp_path / "ball.obj"
     trimesh.creation.icosphere(3, radius=2.0).apply_translation((10, 20, 30)).export(ball)
     assert main(f"scene {ball} -o {tmp_path}/photos {THREE_VIEWS} --up z --depths".split()) == 0
@@ -148,8 +138,6 @@ def test_a_mesh_is_photographed_where_it_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "line"), [("nothing", "nothing: neither a mesh file nor"), ("figure --up z", "--up: goes with a mesh")]
 )
-def test_what_cannot_be_photographed_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, line: str
-) -> None:
+def test_what_cannot_be_photographed_is_one_line(tmp_path, capsys, words: str, line: str):
     assert line in fails(capsys, f"scene {words} -o {tmp_path}/photos")
     assert not (tmp_path / "photos").exists()

@@ -4,7 +4,6 @@ import os
 import signal
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -92,7 +91,7 @@ def test_samples_lie_on_the_carried_surface_and_signs_are_those_of_its_sides():
     assert ((bounds.high == 0) == (truth < 0))[clear].all()
 
 
-def test_a_run_keeps_its_motion_and_resumes_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_run_keeps_its_motion_and_resumes_to_the_same_bits(tmp_path, monkeypatch):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     few = replace(SMALL, motion_steps=6, samples=300)
     run = evolve(few, out=whole)

@@ -38,7 +38,7 @@ def write(path: Path, before: torch.Tensor, after: torch.Tensor) -> str:
     return str(path)
 
 
-def test_lines_commas_and_comments(tmp_path: Path) -> None:
+def test_lines_commas_and_comments(tmp_path):
     (tmp_path / "marks.txt").write_text("# head, then tail\n1 2 3 4 5 6\n\n-1, 0,1e-3, 0,0,7 # tail\n")
     before, after = read_landmarks(tmp_path / "marks.txt")
     np.testing.assert_array_equal(before, [[1, 2, 3], [-1, 0, 1e-3]])
@@ -46,15 +46,13 @@ def test_lines_commas_and_comments(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("text", "said"), [("1 2 3", "line 1"), ("1 2 3 4 5 x", "line 1"), ("# none", "no landmarks")])
-def test_other_lines_are_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_other_lines_are_refused(tmp_path, text: str, said: str):
     (tmp_path / "marks.txt").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=said):
         read_landmarks(tmp_path / "marks.txt")
 
 
-def test_nan_and_missing_files_are_refused_before_shapes_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nan_and_missing_files_are_refused_before_shapes_are_read(tmp_path, monkeypatch):
     monkeypatch.setattr("mplicits.pipelines.evolve.train.read_shape", lambda _: pytest.fail("too late"))
     (tmp_path / "nan.txt").write_text("1 2 3 4 5 nan", encoding="utf-8")
     for name, said in (("nan.txt", "line 1"), ("none.txt", "none.txt")):
@@ -62,14 +60,14 @@ def test_nan_and_missing_files_are_refused_before_shapes_are_read(
             evolve(replace(SMALL, landmarks=(str(tmp_path / name),)))
 
 
-def test_one_file_for_each_two_shapes_of_a_deformation() -> None:
+def test_one_file_for_each_two_shapes_of_a_deformation():
     with pytest.raises(ValueError, match="2 files for 2 shapes"):
         replace(SMALL, landmarks=("a", "b"))
     with pytest.raises(ValueError, match="kind morph"):
         EvolveConfig(shapes=(BALL, BALL), landmarks=("a",))
 
 
-def test_they_go_where_their_shapes_go(tmp_path: Path) -> None:
+def test_they_go_where_their_shapes_go(tmp_path):
     path = write(tmp_path / "marks.txt", corners(), corners())
     placement = Placement(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), 0.5, np.array([0.1, 0, 0]))
     first, second = read_shape(BALL), read_shape(BALL).placed(placement)
@@ -82,7 +80,7 @@ def test_they_go_where_their_shapes_go(tmp_path: Path) -> None:
         placed_landmarks([write(tmp_path / "off.txt", corners(), 2 * corners())], [first, first])
 
 
-def test_landmarks_change_the_plan() -> None:
+def test_landmarks_change_the_plan():
     """Of a ball on itself the cheapest plan moves nothing; landmarks turn it."""
     ball, after = read_shape(BALL), TURN.forward(corners(), 1.0)
     plans = (match(ball, ball, 0), match(ball, ball, 0, Landmarks(corners(), after)))
@@ -91,7 +89,7 @@ def test_landmarks_change_the_plan() -> None:
     assert torch.equal(shapes.nearness(corners(), corners()).diagonal(), torch.ones(6))
 
 
-def test_a_ball_turns(tmp_path: Path) -> None:
+def test_a_ball_turns(tmp_path):
     ball, after = read_shape(BALL), TURN.forward(corners(), 1.0)
     config = replace(SMALL, landmarks=(write(tmp_path / "marks.txt", corners(), after),))
     velocity = learn_motion([ball, ball], (0.0, 1.0), config)

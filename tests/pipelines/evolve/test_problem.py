@@ -38,7 +38,7 @@ def shape_of(field, *, similarity: Similarity | None = None) -> StaticShape:
     return StaticShape("made", field, similarity or Similarity.identity(), mesh)
 
 
-def test_a_placement_and_its_inverse() -> None:
+def test_a_placement_and_its_inverse():
     there = Placement(TURN, 0.5, np.array([0.1, 0.2, -0.3]))
     points = np.random.default_rng(0).normal(size=(50, 3))
     assert np.allclose(there.inverse().apply(there.apply(points)), points)
@@ -48,7 +48,7 @@ def test_a_placement_and_its_inverse() -> None:
     assert np.array_equal(again.apply(points), there.apply(points))
 
 
-def test_a_placed_field_is_the_moved_shape() -> None:
+def test_a_placed_field_is_the_moved_shape():
     placement = Placement(TURN, 0.5, np.array([0.1, 0.2, -0.3]))
     box = Box(half_size=(0.5, 0.3, 0.4)).double()
     placed = Placed(box, placement).double()
@@ -60,7 +60,7 @@ def test_a_placed_field_is_the_moved_shape() -> None:
     assert torch.equal(jet.value, placed.value(moved))
 
 
-def test_exact_shapes_are_read() -> None:
+def test_exact_shapes_are_read():
     shape = read_shape("torus:0.4,0.15@0.1,0,-0.2")
     x = 2 * torch.rand(100, 3) - 1
     exact = Torus(major=0.4, minor=0.15).value(x - torch.tensor([0.1, 0.0, -0.2]))
@@ -72,22 +72,20 @@ def test_exact_shapes_are_read() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("cube", "cube: no such run directory or file, and no exact shape; those are sphere, torus, box, capsule"),
-        ("sphere:big", "sphere:big: got 'big', expected 1 number with commas"),
+        ("cube", "cube: no such run directory or file, and no exact shape"),
+        ("sphere:big", "sphere:big: got 'big'"),
         ("torus:0.4", "torus:0.4: got '0.4', expected 2 numbers"),
         ("sphere:0.4@1,2", "got '1,2', expected 3 numbers"),
-        ("sphere:-1", "sphere:-1: radius=-1.0: expected > 0"),
-        ("sphere:7", "sphere:7: has no surface in the unit sphere"),
+        ("sphere:-1", "sphere:-1: radius"),
+        ("sphere:7", "sphere:7: has no surface"),
     ],
 )
-def test_bad_shapes_are_named(text: str, message: str) -> None:
-    with pytest.raises(InputError) as caught:
+def test_bad_shapes_are_named(text: str, message: str):
+    with pytest.raises(InputError, match=rf"^[^\n]*{message}[^\n]*$"):
         read_shape(text)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
-def test_beyond_its_unit_sphere_a_fit_has_no_parts(tmp_path) -> None:
+def test_beyond_its_unit_sphere_a_fit_has_no_parts(tmp_path):
     file = tmp_path / "fit.safetensors"
     save_field(file, Union(Sphere(radius=0.3), Sphere(radius=0.2, center=(2.0, 0.0, 0.0))))
     field = read_shape(str(file)).field
@@ -96,13 +94,13 @@ def test_beyond_its_unit_sphere_a_fit_has_no_parts(tmp_path) -> None:
     assert torch.equal(field.value(x), Sphere(radius=0.3).value(x))
 
 
-def test_a_field_that_moves_already_is_refused(tmp_path) -> None:
+def test_a_field_that_moves_already_is_refused(tmp_path):
     save_field(tmp_path / "moving.safetensors", small_spacetime())
     with pytest.raises(InputError, match="moves already"):
         read_shape(str(tmp_path / "moving.safetensors"))
 
 
-def test_alignment_none_keeps_input_coordinates() -> None:
+def test_alignment_none_keeps_input_coordinates():
     # Two fits of one ball of radius 5 around (10, 0, 0), each in a unit sphere of its own.
     first = shape_of(Sphere(radius=0.5), similarity=Similarity((10.0, 0.0, 0.0), 10.0))
     second = shape_of(Sphere(radius=0.25, center=(0.1, 0.0, 0.0)), similarity=Similarity((8.0, 0.0, 0.0), 20.0))
@@ -114,7 +112,7 @@ def test_alignment_none_keeps_input_coordinates() -> None:
     assert kept is second
 
 
-def test_alignment_pca_turns_a_shape_back() -> None:
+def test_alignment_pca_turns_a_shape_back():
     """The shape has no symmetry, so that only one of the four ways round is right."""
     lump = Union(Box(half_size=(0.5, 0.3, 0.2)), Sphere(radius=0.2, center=(0.45, 0.3, 0.15)))
     first = shape_of(lump)
@@ -125,7 +123,7 @@ def test_alignment_pca_turns_a_shape_back() -> None:
     assert (second.field.value(x) - first.field.value(x)).abs().mean() > 0.05
 
 
-def test_what_reaches_too_far_is_shrunk() -> None:
+def test_what_reaches_too_far_is_shrunk():
     shapes, region = into_unit_sphere([read_shape("sphere:0.5@0.5,0,0")], np.array([[0.0, 0, 0], [3.0, 0, 0]]))
     assert region == Similarity((1.5, 0.0, 0.0), 1.5)
     x = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
@@ -135,7 +133,7 @@ def test_what_reaches_too_far_is_shrunk() -> None:
     assert into_unit_sphere(kept, np.array([[1.0, 0.0, 0.0]])) == (kept, Similarity.identity())
 
 
-def test_transport_by_rigid_motions_is_known_exactly_and_unions_too() -> None:
+def test_transport_by_rigid_motions_is_known_exactly_and_unions_too():
     problem = built(
         kind="transport",
         shapes=("sphere:0.3@-0.5,0,0", "torus:0.3,0.1@0.4,0,0"),
@@ -166,7 +164,7 @@ def test_transport_by_rigid_motions_is_known_exactly_and_unions_too() -> None:
     assert [end.time for end in problem.ends] == [0.0, 1.0]
 
 
-def test_transport_out_of_the_unit_sphere_shrinks_the_stage() -> None:
+def test_transport_out_of_the_unit_sphere_shrinks_the_stage():
     problem = built(kind="transport", shapes=("sphere:0.5",), velocity=(2.0, 0.0, 0.0))
     scale = problem.similarity.scale
     assert scale == pytest.approx(1.5, abs=0.01)
@@ -178,7 +176,7 @@ def test_transport_out_of_the_unit_sphere_shrinks_the_stage() -> None:
     assert (scale * problem.known.value - (Sphere(radius=0.5).value(x - travelled))).abs().max() < 1e-4
 
 
-def test_a_twist_gives_surface_points_normals_and_signs() -> None:
+def test_a_twist_gives_surface_points_normals_and_signs():
     problem = built(kind="transport", shapes=("box:0.3,0.2,0.5",), twist=(1.5,))
     box = Box(half_size=(0.3, 0.2, 0.5))
 
@@ -202,7 +200,7 @@ def test_a_twist_gives_surface_points_normals_and_signs() -> None:
     assert problem.law is not None
 
 
-def test_the_velocity_of_a_twist_is_the_derivative_of_the_motion() -> None:
+def test_the_velocity_of_a_twist_is_the_derivative_of_the_motion():
     velocity = velocity_field(RigidMotion(angle=0.5, velocity=(0.1, 0.0, 0.2)), 1.5)
     x0 = 2 * torch.rand(50, 3, dtype=torch.float64) - 1
     drift = torch.tensor([0.1, 0.0, 0.2], dtype=torch.float64)
@@ -219,7 +217,7 @@ def test_the_velocity_of_a_twist_is_the_derivative_of_the_motion() -> None:
     assert torch.allclose(found, expected, atol=1e-8)
 
 
-def test_bounds_between_shapes() -> None:
+def test_bounds_between_shapes():
     values = torch.tensor([[0.1, 0.3, 9.0], [0.1, -0.3, 9.0], [-0.1, -0.3, 9.0], [9.0, 0.2, 0.4], [9.0, -0.2, -0.1]])
     low, high = between(torch.tensor([0.1, 0.2, 0.3, 0.6, 0.9]), (0.0, 0.5, 1.0), values)
     inf = math.inf
@@ -227,7 +225,7 @@ def test_bounds_between_shapes() -> None:
     assert torch.allclose(high, torch.tensor([inf, inf, -0.1, inf, -0.1]))
 
 
-def test_a_morph_knows_its_shapes_and_bounds_what_is_between() -> None:
+def test_a_morph_knows_its_shapes_and_bounds_what_is_between():
     problem = built(shapes=("sphere:0.4", "sphere:0.7"))
     for time, radius in ((0.0, 0.4), (1.0, 0.7)):
         here = problem.known.take((problem.known.points[:, 3] == time).nonzero()[:, 0])
@@ -246,7 +244,7 @@ def test_a_morph_knows_its_shapes_and_bounds_what_is_between() -> None:
     assert torch.allclose(problem.law.rate(jet), torch.full((100,), -0.3), atol=1e-4)
 
 
-def test_the_law_counts_per_interval_between_keys() -> None:
+def test_the_law_counts_per_interval_between_keys():
     problem = built(shapes=("sphere:0.4", "sphere:0.7"))
     assert problem.keys == (0.0, 1.0)
 
@@ -265,7 +263,7 @@ def test_the_law_counts_per_interval_between_keys() -> None:
     assert once / 16 < law((0.0, 0.25, 1.0)) < once * 9 / 16
 
 
-def test_smoothing_is_bounded_by_the_sphere_around_the_shape() -> None:
+def test_smoothing_is_bounded_by_the_sphere_around_the_shape():
     problem = built(kind="smooth", shapes=("sphere:0.8",), alpha=0.12)
     truth = ShrinkingSphere(radius=0.8, alpha=0.12)
     value = truth.value(problem.bounds.points)
@@ -278,7 +276,7 @@ def test_smoothing_is_bounded_by_the_sphere_around_the_shape() -> None:
 
 
 @pytest.mark.parametrize(("kind", "count"), [("morph", 1), ("smooth", 2), ("transport", 0)])
-def test_the_number_of_shapes_is_checked(kind, count: int) -> None:
+def test_the_number_of_shapes_is_checked(kind, count: int):
     with pytest.raises(InputError, match=f"{count} shapes for kind {kind}; expected"):
         built(kind=kind, shapes=("sphere",) * count)
 
@@ -292,12 +290,12 @@ def test_the_number_of_shapes_is_checked(kind, count: int) -> None:
         ({"axis": (0.0, 0.0, 0.0)}, r"axis: \(0.0, 0.0, 0.0\)"),
     ],
 )
-def test_settings_out_of_range_are_named(settings: dict, message: str) -> None:
+def test_settings_out_of_range_are_named(settings: dict, message: str):
     with pytest.raises(ValueError, match=message):
         EvolveConfig(**settings)
 
 
-def test_a_motion_that_cannot_be_followed_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_motion_that_cannot_be_followed_is_bad_input(monkeypatch):
     soon = functools.partial(trajectories, solver=Solver(max_steps=50))
     monkeypatch.setattr(evolve_problem, "trajectories", soon)
     with pytest.raises(InputError, match=r"the motion cannot be followed .*reached time"):

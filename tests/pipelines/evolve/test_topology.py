@@ -83,7 +83,7 @@ def test_more_pieces_than_at_either_end_are_warned_about():
     assert not warnings({"frames": frames, "ends": ends[:1]})
 
 
-def test_of_many_changes_the_first_ones_have_a_place(monkeypatch: pytest.MonkeyPatch):
+def test_of_many_changes_the_first_ones_have_a_place(monkeypatch):
     monkeypatch.setattr(topology, "CHANGES", dataclasses.replace(CHANGES, placed=1))
 
     def blinking(x: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ FLAGS = (
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(tmp_path_factory) -> Path:
     directory = tmp_path_factory.mktemp("runs") / "whole"
     with pytest.MonkeyPatch.context() as patch:
         few_points(patch)
@@ -49,7 +49,7 @@ def interrupt(stage: str, step: int) -> Callable[[Progress], None]:
     return report
 
 
-def test_a_travelling_sphere_is_learnt() -> None:
+def test_a_travelling_sphere_is_learnt():
     field = evolve(QUICK).field
     truth = Moving(Sphere(radius=0.4, center=(-0.2, 0.0, 0.0)), TRAVEL)
     points = torch.nn.functional.normalize(torch.randn(3000, 3), dim=1) * 0.4 + torch.tensor([-0.2, 0.0, 0.0])
@@ -60,7 +60,7 @@ def test_a_travelling_sphere_is_learnt() -> None:
     assert slope_figures(field)["mean"] == pytest.approx(1, abs=0.05)
 
 
-def test_the_second_level_improves_on_the_first(finished: Path) -> None:
+def test_the_second_level_improves_on_the_first(finished: Path):
     record = json.loads((finished / "run.json").read_text())
     first, second = record["stages"]
     assert second["rms_at_ends"] < first["rms_at_ends"]
@@ -69,7 +69,7 @@ def test_the_second_level_improves_on_the_first(finished: Path) -> None:
     assert record["parameters"] == 2 * first["parameters"]
 
 
-def test_points_of_a_band_are_spread_over_it() -> None:
+def test_points_of_a_band_are_spread_over_it():
     truth = ShrinkingSphere(radius=0.8, alpha=0.1)
     points = band_points(truth, 4000, 0.2, torch.Generator().manual_seed(0))
     value = truth.value(points)
@@ -79,14 +79,14 @@ def test_points_of_a_band_are_spread_over_it() -> None:
     assert [float(x) for x in points[:, 3].histc(4, 0, 1) / len(value)] == pytest.approx([0.25] * 4, abs=0.12)
 
 
-def test_points_of_a_residual_band_lie_in_it() -> None:
+def test_points_of_a_residual_band_lie_in_it():
     field = MultiscaleSDF(ShrinkingSphere(radius=0.8, alpha=0.1), [Siren(16, 1, omega=5.0, in_dim=4)], [0.05])
     points = band_points(field, 2000, 0.05, torch.Generator().manual_seed(0), level=1)
     assert len(points) > 500
     assert bool(field.in_band(points, level=1).all())
 
 
-def test_the_checks_of_an_exact_field() -> None:
+def test_the_checks_of_an_exact_field():
     truth = ShrinkingSphere(radius=0.8, alpha=0.12)
     unit = torch.nn.functional.normalize(torch.randn(4000, 3), dim=1)
     other = torch.nn.functional.normalize(torch.randn(4000, 3), dim=1)
@@ -102,7 +102,7 @@ def test_the_checks_of_an_exact_field() -> None:
     assert checks["warnings"] == []
 
 
-def test_empty_frames_and_missed_ends_are_warned_about() -> None:
+def test_empty_frames_and_missed_ends_are_warned_about():
     nothing = Moving(Sphere(radius=0.1, center=(9.0, 0.0, 0.0)), TRAVEL)
     points = torch.rand(100, 3)
     checks = check_evolution(nothing, [End("ball", 0.0, points, points)], frames=4, resolution=16)
@@ -116,7 +116,7 @@ def test_empty_frames_and_missed_ends_are_warned_about() -> None:
     assert "times its floor" in wrong["warnings"][0]
 
 
-def test_a_run_holds_its_field_and_its_record(finished: Path) -> None:
+def test_a_run_holds_its_field_and_its_record(finished: Path):
     field, _, metadata = load_field(finished / "field.safetensors")
     assert field.num_levels == 2
     assert {path.name for path in finished.iterdir()} == {"field.safetensors", "run.json", "run.lock"}
@@ -130,7 +130,7 @@ def test_a_run_holds_its_field_and_its_record(finished: Path) -> None:
 
 
 @pytest.mark.parametrize(("stage", "step"), [("level 0", 40), ("level 1", 20), ("checks", 1)])
-def test_an_interrupted_run_resumes_to_the_same_field(finished: Path, tmp_path: Path, stage: str, step: int) -> None:
+def test_an_interrupted_run_resumes_to_the_same_field(finished: Path, tmp_path, stage: str, step: int):
     directory = tmp_path / "run"
     if stage == "checks":  # what was trained is kept; the flag is only read between steps
         evolve(BRIEF, out=directory, progress=interrupt(stage, step))
@@ -145,7 +145,7 @@ def test_an_interrupted_run_resumes_to_the_same_field(finished: Path, tmp_path: 
     torch.testing.assert_close(found, expected, rtol=0, atol=0)
 
 
-def test_other_shapes_cannot_be_resumed(tmp_path: Path) -> None:
+def test_other_shapes_cannot_be_resumed(tmp_path):
     file = tmp_path / "ball.safetensors"
     ball(file, 0.4)
     config = replace(BRIEF, shapes=(str(file),))
@@ -156,13 +156,13 @@ def test_other_shapes_cannot_be_resumed(tmp_path: Path) -> None:
         evolve(config, out=tmp_path / "run", resume=True)
 
 
-def test_a_time_budget_ends_the_training() -> None:
+def test_a_time_budget_ends_the_training():
     record = evolve(replace(BRIEF, steps=(100_000, 100_000), time_budget=1.0)).record
     assert all(stage["ended_by_time_budget"] for stage in record["stages"])
     assert record["training_seconds"] < 5
 
 
-def test_a_morph_of_two_runs_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_morph_of_two_runs_on_the_command_line(tmp_path, capsys):
     files = [tmp_path / f"{name}.safetensors" for name in "ab"]
     for file, radius in zip(files, (0.4, 0.6), strict=True):
         ball(file, radius)
@@ -178,7 +178,7 @@ def test_a_morph_of_two_runs_on_the_command_line(tmp_path: Path, capsys: pytest.
     assert "nothing to resume" in fails(capsys, f"evolve -o {run} --resume")
 
 
-def test_a_yaml_file_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_yaml_file_on_the_command_line(tmp_path, capsys):
     file = tmp_path / "scene.yaml"
     file.write_text("kind: smooth\nshapes: [sphere:0.6]\nalpha: 0.03\n")
     assert main(f"evolve {file} -o {tmp_path / 'run'} {FLAGS}".split()) == 0
@@ -201,17 +201,17 @@ def test_a_yaml_file_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
         ("sphere -o RUN --resume", "--resume: continues with the run's own settings"),
     ],
 )
-def test_bad_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: str, message: str) -> None:
+def test_bad_arguments(tmp_path, capsys, arguments: str, message: str):
     run = tmp_path / "run"
     assert message in fails(capsys, f"evolve {arguments.replace('RUN', str(run))} --quiet")
     assert not run.exists()
 
 
-def test_the_bundled_presets_are_valid() -> None:
+def test_the_bundled_presets_are_valid():
     assert all(load_config(EvolveConfig, name) for name in preset_names("evolve"))
 
 
-def test_a_budget_that_is_too_small_leaves_out_levels_and_samples(tmp_path: Path) -> None:
+def test_a_budget_that_is_too_small_leaves_out_levels_and_samples(tmp_path):
     """A tenth of a second is less than sixty steps of a (512, 4) level take, and less than these checks."""
     config = replace(BRIEF, widths=(16, 512), depths=(1, 4), samples=400_000, frames=40, batch=4096, time_budget=0.1)
     record = evolve(config, out=tmp_path / "run").record

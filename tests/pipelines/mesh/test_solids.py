@@ -30,7 +30,7 @@ def ball(path: Path, radius: float, offset: float = 0.0) -> Path:
 
 
 @pytest.fixture
-def balls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def balls(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     ball(Path("a.safetensors"), RADIUS)
     ball(Path("b.safetensors"), OTHER, APART)
@@ -54,7 +54,7 @@ A, B = 4 / 3 * math.pi * RADIUS**3, 4 / 3 * math.pi * OTHER**3
     ("operation", "exact"),
     [("union", A + B - volume_of_lens()), ("intersection", volume_of_lens()), ("difference", A - volume_of_lens())],
 )
-def test_two_balls(balls: Path, operation: str, exact: float) -> None:
+def test_two_balls(balls: Path, operation: str, exact: float):
     second = "b.safetensors"
     if operation == "difference":
         second = "b.stl"
@@ -71,7 +71,7 @@ def test_two_balls(balls: Path, operation: str, exact: float) -> None:
     assert abs(A + B - volume_of_lens() - A) > 2 * allowed  # the operations differ by more
 
 
-def test_a_field_of_two_runs_is_meshed_later(balls: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_field_of_two_runs_is_meshed_later(balls: Path, capsys):
     assert (
         main(["boolean", "a.safetensors", "b.safetensors", "--union", "--smooth", "4", "-o", "both.safetensors"]) == 0
     )
@@ -89,7 +89,7 @@ def test_a_field_of_two_runs_is_meshed_later(balls: Path, capsys: pytest.Capture
     ("by", "flags"), [("2mm", "--unit mm"), ("0.2cm", "--unit mm"), ("2", ""), ("-2mm", "--unit mm")]
 )
 @pytest.mark.parametrize("source", ["a.safetensors", "a.stl"])
-def test_a_ball_is_grown_and_shrunk(balls: Path, by: str, flags: str, source: str) -> None:
+def test_a_ball_is_grown_and_shrunk(balls: Path, by: str, flags: str, source: str):
     run(f"mesh a.safetensors -o a.stl --resolution {RESOLUTION}")
     run(f"offset {source} --by {by} -o out.ply --resolution {RESOLUTION} {flags}")
     mesh = trimesh.load_mesh("out.ply")
@@ -106,7 +106,7 @@ def test_a_ball_is_grown_and_shrunk(balls: Path, by: str, flags: str, source: st
 
 
 @pytest.mark.parametrize(("by", "inner", "outer"), [("-5", RADIUS - 5, RADIUS), ("5", RADIUS, RADIUS + 5)])
-def test_a_hollow_ball(balls: Path, by: str, inner: float, outer: float) -> None:
+def test_a_hollow_ball(balls: Path, by: str, inner: float, outer: float):
     run(f"offset a.safetensors --by {by} --shell -o out.stl --resolution 40")
     mesh = trimesh.load_mesh("out.stl")
     assert mesh.is_watertight
@@ -116,7 +116,7 @@ def test_a_hollow_ball(balls: Path, by: str, inner: float, outer: float) -> None
     assert abs(mesh.volume - exact) < 2 * 4 * math.pi * (outer**2 + inner**2) * 3 * step**2 / (8 * inner)
 
 
-def test_a_mesh_is_an_exact_distance() -> None:
+def test_a_mesh_is_an_exact_distance():
     box = trimesh.creation.box((1.0, 0.6, 0.8))
     surface = Mesh(np.asarray(box.vertices), np.asarray(box.faces)[:, ::-1].astype(np.int64))  # inside out
     field, exact = MeshField(surface), Box(half_size=(0.5, 0.3, 0.4))
@@ -136,7 +136,7 @@ def test_a_mesh_is_an_exact_distance() -> None:
     ("text", "unit", "expected"),
     [("2mm", "m", 0.002), ("1in", "mm", 25.4), ("-0.5", None, -0.5), ("1e-3m", "mm", 1.0), (" .5 cm", "mm", 5.0)],
 )
-def test_lengths(text: str, unit: str | None, expected: float) -> None:
+def test_lengths(text: str, unit: str | None, expected: float):
     assert abs(solids.length_in(text, unit, "--by") - expected) < 1e-12 * abs(expected)
 
 
@@ -161,7 +161,7 @@ def test_lengths(text: str, unit: str | None, expected: float) -> None:
         ("offset a.safetensors --by 2 --time 0.5 -o o.stl", "does not move"),
     ],
 )
-def test_one_line_says_what_is_wrong(balls: Path, capsys: pytest.CaptureFixture[str], words: str, message: str) -> None:
+def test_one_line_says_what_is_wrong(balls: Path, capsys, words: str, message: str):
     ball(Path("far.safetensors"), RADIUS, 500.0)
     box = trimesh.creation.box((1.0, 0.6, 0.8))
     box.export("box.ply")
@@ -170,7 +170,7 @@ def test_one_line_says_what_is_wrong(balls: Path, capsys: pytest.CaptureFixture[
     assert not Path("o.ply").exists()
 
 
-def test_blobs_are_not_joined(tmp_path: Path) -> None:
+def test_blobs_are_not_joined(tmp_path):
     """What no points of a run support is left out of the union, unless the mesh beside it reaches there."""
     scan = neural_fields.WorldField(Union(Sphere(radius=0.4), Sphere(radius=0.15, center=(0.0, 0.0, 0.75))))
     other = neural_fields.WorldField(Sphere(radius=0.2, center=(0.7, 0.0, 0.0)))

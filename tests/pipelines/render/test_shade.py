@@ -83,10 +83,6 @@ def test_shading_runs_where_the_view_is(device):
         assert compose(seen, rgb).shape == (SIZE, SIZE, 3)
 
 
-def test_normals_and_own_colours_are_shown_as_they_are():
-    seen = ball(CAMERA, color=torch.tensor([0.25, 0.5, 0.75]))
-    torch.testing.assert_close(shade(seen, "normals", camera=CAMERA), (seen.normal + 1) / 2)
-    assert torch.equal(shade(seen, "color", camera=CAMERA), seen.color)
 
 
 def test_the_headlight_is_brightest_in_the_middle_and_the_key_lamp_above_left():

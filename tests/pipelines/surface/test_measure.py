@@ -241,7 +241,7 @@ def test_unusable_files_are_one_line(tmp_path, name, content, message):
     assert name in str(caught.value)
 
 
-def test_what_no_photograph_sees_does_not_count() -> None:
+def test_what_no_photograph_sees_does_not_count():
     """Half of a square is missing, and no photograph has seen that half."""
 
     truth, half, counted = square(3.0), square(3.0, side=0.5), []

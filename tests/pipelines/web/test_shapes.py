@@ -42,14 +42,14 @@ def ball(file: Path) -> None:
 
 
 @pytest.fixture
-def cloud(tmp_path: Path) -> Path:
+def cloud(tmp_path) -> Path:
     points = sample_sphere(500).points * 4 + np.array([10.0, 0.0, 0.0])
     write_cloud_ply(tmp_path / "cloud.ply", PointCloud(points, None, np.abs(points / 13).clip(0, 1).astype(np.float32)))
     return tmp_path / "cloud.ply"
 
 
 @pytest.fixture
-def box(tmp_path: Path) -> Path:
+def box(tmp_path) -> Path:
     trimesh.creation.box((2, 1, 1)).export(tmp_path / "box.obj")
     return tmp_path / "box.obj"
 
@@ -65,7 +65,7 @@ def read_by_page(source: Path, one: dict | None = None, other: dict | None = Non
     return json.loads(subprocess.run([NODE, "-e", script + READ], input=given, capture_output=True, text=True).stdout)
 
 
-def test_the_page_reads_the_points_of_a_cloud(cloud: Path) -> None:
+def test_the_page_reads_the_points_of_a_cloud(cloud: Path):
     header, arrays, *_ = read_by_page(cloud)
     (shape,) = header["shapes"]
     assert (shape["kind"], shape["count"], shape["colored"], header["levels"]) == ("points", 500, True, [])
@@ -78,7 +78,7 @@ def test_the_page_reads_the_points_of_a_cloud(cloud: Path) -> None:
     assert 0 < shape["size"] < 0.5
 
 
-def test_the_page_reads_the_triangles_of_a_mesh(box: Path) -> None:
+def test_the_page_reads_the_triangles_of_a_mesh(box: Path):
     header, arrays, *_ = read_by_page(box)
     (shape,) = header["shapes"]
     assert (shape["kind"], shape["count"], shape["colored"]) == ("triangles", 12, False)
@@ -88,7 +88,7 @@ def test_the_page_reads_the_triangles_of_a_mesh(box: Path) -> None:
     assert np.allclose(extent, [2, 1, 1])
 
 
-def test_what_is_nearer_is_seen(box: Path) -> None:
+def test_what_is_nearer_is_seen(box: Path):
     one = {"seen": [0, 0, 1, 2, 0, 0, 1, 2, 0, 0, 0, 0, 0, 0, 1, 2], "color": []}
     other = {"seen": [1, 0, 0, 2.05, 1, 0, 0, 3, 1, 0, 0, 9, 0, 0, 0, 0], "color": [0.5] * 16}
     *_, seen, color = read_by_page(box, one, other)
@@ -96,7 +96,7 @@ def test_what_is_nearer_is_seen(box: Path) -> None:
     assert np.array(color).reshape(4, 4)[:, 0].tolist() == [0.5, 0, 0.5, 0]
 
 
-def test_a_field_that_no_shader_traces_is_shown_as_a_mesh(tmp_path: Path) -> None:
+def test_a_field_that_no_shader_traces_is_shown_as_a_mesh(tmp_path):
     save_field(tmp_path / "ball.safetensors", Sphere(radius=0.5))
     packed = pack(tmp_path / "ball.safetensors")
     (shape,) = packed.header["shapes"]
@@ -105,7 +105,7 @@ def test_a_field_that_no_shader_traces_is_shown_as_a_mesh(tmp_path: Path) -> Non
     assert main(["web", str(tmp_path / "ball.safetensors"), "-o", str(tmp_path / "ball.html")]) == 0
 
 
-def test_the_cloud_beside_a_field_has_the_colours_of_its_distance(cloud: Path, tmp_path: Path) -> None:
+def test_the_cloud_beside_a_field_has_the_colours_of_its_distance(cloud: Path, tmp_path):
     ball(tmp_path / "ball.safetensors")
     packed = pack(tmp_path / "ball.safetensors", WebOptions(cloud=cloud))
     (shape,) = packed.header["shapes"]
@@ -117,7 +117,7 @@ def test_the_cloud_beside_a_field_has_the_colours_of_its_distance(cloud: Path, t
     assert pack(tmp_path / "ball.safetensors", WebOptions(cloud="auto")).header["shapes"] == []
 
 
-def test_mistakes_are_one_line(cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_are_one_line(cloud: Path, tmp_path, capsys):
     ball(tmp_path / "ball.safetensors")
     run, page = str(tmp_path / "ball.safetensors"), str(tmp_path / "page.html")
     (tmp_path / "empty.ply").write_text("ply")
@@ -133,7 +133,7 @@ def test_mistakes_are_one_line(cloud: Path, tmp_path: Path, capsys: pytest.Captu
         assert expected in fails(capsys, line)
 
 
-def test_landmarks_are_kept_in_input_coordinates(tmp_path: Path) -> None:
+def test_landmarks_are_kept_in_input_coordinates(tmp_path):
     ball(tmp_path / "a.safetensors")
     save_field(tmp_path / "b.safetensors", Sphere(radius=0.5))
     pairs = Pairs((tmp_path / "a.safetensors", tmp_path / "b.safetensors"), tmp_path / "pairs.txt")
@@ -172,7 +172,7 @@ def depth_of_discs(eye: np.ndarray, directions: np.ndarray, forward: np.ndarray,
 
 
 @pytest.mark.parametrize("kind", ["cloud", "mesh", "both"])
-def test_a_page_draws_what_it_shows(browser, cloud: Path, tmp_path: Path, kind: str) -> None:
+def test_a_page_draws_what_it_shows(browser, cloud: Path, tmp_path, kind: str):
     """Depths of a ball as points, as triangles, and as points around a traced field, against exact ones."""
     source = {"cloud": cloud, "mesh": tmp_path / "ball.ply", "both": tmp_path / "ball.safetensors"}[kind]
     out = tmp_path / "page.html"
@@ -205,7 +205,7 @@ def test_a_page_draws_what_it_shows(browser, cloud: Path, tmp_path: Path, kind: 
     assert not browser.find_element("id", "message").is_displayed()
 
 
-def test_landmarks_are_clicked(browser, tmp_path: Path) -> None:
+def test_landmarks_are_clicked(browser, tmp_path):
     for name in "ab":
         ball(tmp_path / f"{name}.safetensors")
     pairs = Pairs((tmp_path / "a.safetensors", tmp_path / "b.safetensors"), tmp_path / "pairs.txt")

@@ -69,11 +69,9 @@ def at(browser, x, y, *, click=False):
 def reading(browser):
     """Position, normal if there is one, and the distances of the levels, in the input's units."""
     text = until(lambda: shown(browser, "reading"))
-    numbers = {line.split()[0]: re.findall(rf"(?<![f\d]){NUMBER}", line.split(": ")[-1]) for line in text.splitlines()}
-    place = np.array([float(number) for number in numbers["on"]])
-    distances = [float(value) for value in re.findall(rf"= ({NUMBER})", text)]
-    normal = np.array([float(number) for number in numbers["normal"]]) if "normal" in numbers else None
-    return text, place, normal, np.array(distances)
+    lines = {line.split()[0]: re.findall(rf"(?<![f\d]){NUMBER}", line.split(": ")[-1]) for line in text.splitlines()}
+    place, normal = (np.array(lines[name], float) if name in lines else None for name in ("on", "normal"))
+    return text, place, normal, np.array(re.findall(rf"= ({NUMBER})", text), float)
 
 
 def values_at(place):
@@ -166,9 +164,7 @@ def test_pictures_and_films_are_saved(resting, tmp_path):
     ending, data = resting.execute_async_script(film)
     assert ending == "webm"
     (tmp_path / "film.webm").write_bytes(bytes(data))
-    shown = cv2.VideoCapture(str(tmp_path / "film.webm"))
-    good, first = shown.read()
-    assert good
+    _, first = cv2.VideoCapture(str(tmp_path / "film.webm")).read()
     assert min(first.shape[:2]) == 24
     assert first.std() > 10
 

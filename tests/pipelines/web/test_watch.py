@@ -3,7 +3,6 @@
 import time
 from pathlib import Path
 
-import pytest
 from mplicits.datasets import sample_sphere, write_cloud_ply
 from mplicits.neural_fields import load_field, save_field
 from mplicits.pipelines.cli.entry import main
@@ -17,7 +16,7 @@ def checkpoint(run: Path) -> None:
     save_field(run / "field.safetensors", round_field(0.5))
 
 
-def test_the_page_comes_with_the_first_checkpoint_of_this_run(tmp_path: Path) -> None:
+def test_the_page_comes_with_the_first_checkpoint_of_this_run(tmp_path):
     checkpoint(tmp_path)  # another run's, which will be replaced
     said: list[str] = []
     with Watcher(tmp_path, say=said.append, look_every=0.01) as watcher:
@@ -29,7 +28,7 @@ def test_the_page_comes_with_the_first_checkpoint_of_this_run(tmp_path: Path) ->
         until(lambda: watcher.shown == 1)
 
 
-def test_what_fails_is_said_once_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_fails_is_said_once_and_no_more(tmp_path, monkeypatch):
 
     def fail(*_: object, **__: object) -> object:
         raise RuntimeError("no such screen")
@@ -42,7 +41,7 @@ def test_what_fails_is_said_once_and_no_more(tmp_path: Path, monkeypatch: pytest
     assert said == ["--watch: ended (no such screen)"]
 
 
-def test_a_fit_is_watched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fit_is_watched(tmp_path, capsys):
     """With nobody connected, and with the same result."""
     write_cloud_ply(tmp_path / "ball.ply", sample_sphere(500))
     runs = [tmp_path / "plain", tmp_path / "watched"]
