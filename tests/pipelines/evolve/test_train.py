@@ -2,15 +2,12 @@
 
 import json
 import math
-import os
-import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from evolutions import BRIEF, QUICK, ball, fails, few_points
+from evolutions import BRIEF, QUICK, ball, fails, few_points, interrupt
 from mplicits.neural_fields import InputError, Moving, MultiscaleSDF, RigidMotion, Siren, Sphere, at_time, load_field
 from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.cli.entry import main
@@ -19,7 +16,7 @@ from mplicits.pipelines.evolve.problem import End
 from mplicits.pipelines.evolve.samples import band_points
 from mplicits.pipelines.evolve.train import evolve
 from mplicits.pipelines.training.settings import EvolveConfig, load_config, preset_names
-from mplicits.pipelines.training.trainer import Interrupted, Progress
+from mplicits.pipelines.training.trainer import Interrupted
 
 TRAVEL = RigidMotion(velocity=(0.4, 0.0, 0.0))
 FLAGS = (
@@ -35,18 +32,6 @@ def finished(tmp_path_factory) -> Path:
         few_points(patch)
         evolve(BRIEF, out=directory)
     return directory
-
-
-def interrupt(stage: str, step: int) -> Callable[[Progress], None]:
-    """A progress display that asks for an end, once, at a step of a stage."""
-    done = []
-
-    def report(progress: Progress) -> None:
-        if progress.stage.startswith(stage) and progress.step == step and not done:
-            done.append(step)
-            os.kill(os.getpid(), signal.SIGINT)
-
-    return report
 
 
 def test_a_travelling_sphere_is_learnt():

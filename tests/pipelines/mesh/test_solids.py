@@ -121,9 +121,7 @@ def test_a_mesh_is_an_exact_distance():
     surface = Mesh(np.asarray(box.vertices), np.asarray(box.faces)[:, ::-1].astype(np.int64))  # inside out
     field, exact = MeshField(surface), Box(half_size=(0.5, 0.3, 0.4))
     x = 2 * torch.rand(500, 3, dtype=torch.float64) - 1
-    mine, theirs = field.jet(x), exact.jet(x)
-    torch.testing.assert_close(mine.value, theirs.value, rtol=0, atol=1e-12)
-    torch.testing.assert_close(mine.gradient, theirs.gradient, rtol=0, atol=1e-12)
+    torch.testing.assert_close(field.jet(x)[:2], exact.jet(x)[:2], rtol=0, atol=1e-12)
     assert abs(field.volume - 0.48) < 1e-12
     assert abs(extract_mesh(field, resolution=32).vertices).max() < 0.5 + 1e-6
     on_face = torch.tensor([[0.5, 0.1, 0.1]], dtype=torch.float64)

@@ -83,8 +83,6 @@ def test_shading_runs_where_the_view_is(device):
         assert compose(seen, rgb).shape == (SIZE, SIZE, 3)
 
 
-
-
 def test_the_headlight_is_brightest_in_the_middle_and_the_key_lamp_above_left():
     seen = ball(CAMERA)
     middle = (SIZE - 1) / 2

@@ -3,7 +3,6 @@
 What it traces is compared with the tracer of this package, both to the same precision, from the same cameras.
 """
 
-import itertools
 from contextlib import contextmanager
 
 import numpy as np
@@ -63,9 +62,9 @@ def test_the_page_traces_what_this_package_traces(opened, name):
     camera, level = cameras()[name]
     found, counts = rendered(opened, camera, level=level)
     assert_same(found, rounded_field(bumpy(), BITS), camera, level)
-    # A finer level is asked in the band of the one before it alone, and no level that is not wanted.
-    for asked in (counts["values"][:3], counts["jets"][:3]):
-        assert all(fine <= before for before, fine in itertools.pairwise(asked))
+    # A finer level is evaluated in the band of the one before it alone, and no level that is not wanted.
+    for evaluated in (counts["values"][:3], counts["jets"][:3]):
+        assert evaluated == sorted(evaluated, reverse=True)
     assert counts["values"][level + 1 :] == [0] * (3 - level)  # the last are the colours
     assert (found[..., 3] > 0).sum() <= counts["jets"][0] <= 3 * (found[..., 3] > 0).sum()
     assert not complaints(opened)
@@ -127,10 +126,9 @@ def test_colours_are_those_of_the_texture(opened):
 def test_a_single_ray_finds_what_the_picture_shows(opened):
     camera, level = cameras()["around"]
     found, _ = rendered(opened, camera, level=level)
-    row, column = np.argwhere(found[..., 3] > 0)[len(found) // 2]
-    x, y = int(column), int(row)
+    row, column = np.argwhere(found[..., 3] > 0)[len(found) // 2].tolist()
     pick = "return window.mplicits.renderer.pick(arguments[0], arguments[1])"
-    picked = opened.execute_script(pick, x, y)
+    picked = opened.execute_script(pick, column, row)
     assert np.allclose([*picked["normal"], picked["depth"]], found[row, column], atol=1e-4)
     script = "return window.mplicits.renderer.values(Float32Array.from(arguments[0]), 2).then((f) => Array.from(f))"
     (value,) = opened.execute_script(script, picked["position"])
@@ -139,28 +137,23 @@ def test_a_single_ray_finds_what_the_picture_shows(opened):
 
 
 def test_the_bench_counts_what_networks_are_asked(opened):
-    found = opened.execute_async_script(
-        "const done = arguments[0]; window.mplicits.bench({size: 24, frames: 2, level: 1}).then(done);"
-    )
+    found = opened.execute_script("return window.mplicits.bench({size: 24, frames: 2, level: 1})")
     base, fine, none, colors = found["evaluations"]
     assert base > fine > 0
     assert none == colors == 0
     # Each evaluation of (32, 2) is 32·3 + 32·32 + 32 products; a jet is two.
     once = 2 * (base * (32 * 3 + 32 * 32 + 32) + fine * (18 * 3 + 18 * 18 + 18)) * 24**2
     assert once < found["operations"] < 2 * once
-    assert found["fps"] > 0
-    assert found["read"] > 0
+    assert min(found["fps"], found["read"]) > 0
 
 
 def test_what_a_person_sees_and_does(opened):
     assert message(opened) == ""
-    assert opened.title == TITLE
-    assert opened.find_element(By.ID, "title").text == TITLE
+    assert opened.title == opened.find_element(By.ID, "title").text == TITLE
     assert not opened.find_elements(By.TAG_NAME, "img")
     facts = opened.find_element(By.ID, "facts").text
-    assert "SIRENs 32 × 2, 18 × 2, 16 × 3" in facts
-    assert "δ = 12, 5 input units" in facts
-    assert f"weights of {BITS} bits: off by ≤ " in facts
+    for words in ("SIRENs 32 × 2, 18 × 2, 16 × 3", "δ = 12, 5 input units", f"weights of {BITS} bits: off by ≤ "):
+        assert words in facts
     canvas = opened.find_element(By.ID, "picture")
     level = opened.find_element(By.ID, "level")
     assert level.get_attribute("value") == "2"

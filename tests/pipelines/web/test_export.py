@@ -13,12 +13,12 @@ from mplicits.neural_fields.spacetime.field import SpaceTimeSDF
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.export import BITS
 from mplicits.pipelines.web.payload import text_of
-from pages import round_field, written_header
+from pages import bumpy, written_header
 
 NASTY = '</script><img src=x onerror="document.title=1">@DATA@'
 
 
-BALL = round_field(0.6, levels=2)
+BALL = bumpy()
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_a_page_is_whole_and_lets_nothing_else_in(run, tmp_path, capsys):
     data = zlib.decompress(bytes_of(re.search(r'id="data">(.*?)</script>', text)[1]), -zlib.MAX_WBITS)
     assert header["bytes"] == len(data)
     assert header["crc32"] == zlib.crc32(data)
-    assert [part["width"] for part in header["levels"]] == [16, 8]
+    assert [part["width"] for part in header["levels"]] == [32, 18, 16]
     assert header["title"] == "ball"
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
     assert policy.startswith("default-src 'none'; ")
@@ -92,7 +92,7 @@ def test_exact_weights_and_fewer_levels(run, tmp_path, capsys):
         out = tmp_path / f"{name}.html"
         assert web(run, "-o", out, *flags) == 0
         sizes[name], header = out.stat().st_size, written_header(out)
-        assert len(header["levels"]) == (1 if name == "one" else 2)
+        assert len(header["levels"]) == (1 if name == "one" else 3)
         assert header["bits"] == (None if name == "exact" else BITS)
     assert sizes["one"] < sizes["all"] < sizes["exact"]
     assert "weights of" not in capsys.readouterr().out.splitlines()[-1]
@@ -102,7 +102,7 @@ def test_a_moment_of_a_field_that_moves(tmp_path):
     file, page = tmp_path / "moving.safetensors", tmp_path / "page.html"
     save_field(file, SpaceTimeSDF.from_static(BALL))
     assert web(file, "-o", page, "--time", 0.5) == 0
-    assert [part["width"] for part in written_header(page)["levels"]] == [16, 8]
+    assert [part["width"] for part in written_header(page)["levels"]] == [32, 18, 16]
 
 
 def test_mistakes_are_one_line(run, tmp_path, capsys):
@@ -116,7 +116,7 @@ def test_mistakes_are_one_line(run, tmp_path, capsys):
         (f"{run} -o {foreign}", "no page of this command"),
         (f"{tmp_path}/none -o {out}", "no such file"),
         (f"{moving} -o {out} --cloud {foreign}", "--cloud"),
-        (f"{run} -o {out} --levels 3", "has levels 0 to 1"),
+        (f"{run} -o {out} --levels 4", "has levels 0 to 2"),
         (f"{run} -o {out} --time 0.5", "does not move"),
     ):
         assert expected in fails(capsys, f"web {words}")
