@@ -5,7 +5,7 @@ import trimesh
 from glb import glb_parts, view_of
 from mplicits.datasets import read_textured, sample_textured
 from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Plane, Similarity, Sphere
-from mplicits.neural_fields.meshing.placement import Placement
+from mplicits.neural_fields.fields.similarity import Placement
 from mplicits.pipelines.mesh import atlas as unwrap_module
 from mplicits.pipelines.mesh.atlas import from_frame, unwrap, vertex_tangents
 from mplicits.pipelines.mesh.bake import bake, check_texture_size, textured_mesh
