@@ -64,7 +64,6 @@ def test_errors_are_those_of_closed_forms():
 
 @pytest.mark.slow
 def test_every_level_is_nearer_to_the_statue(tmp_path, capsys):
-    """What the demo is there to show, at the scan's points."""
     assert main(["demo", "-o", str(tmp_path / "demo")]) == 0
     table = figures(capsys.readouterr().out)
     levels = np.array([row for name, row in table.items() if re.fullmatch(r"level \d, at the scan's points", name)])

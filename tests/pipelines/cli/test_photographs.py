@@ -32,6 +32,12 @@ TINY = (
 THREE_VIEWS = "--views 3 --size 16 --samples 1"
 
 
+def photographs(folder: Path) -> Path:
+    """Four of the painted sphere, with their cameras."""
+    write_colmap(folder, render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1))
+    return folder
+
+
 @pytest.fixture
 def finder(monkeypatch) -> list[dict[str, Any]]:
     """In COLMAP's place, a function that has the cameras."""
@@ -40,8 +46,7 @@ def finder(monkeypatch) -> list[dict[str, Any]]:
     def find(source: Path, project: Path, **options: Any) -> FoundCameras:
         calls.append({"source": source, "project": project, **options})
         if not project.exists():
-            images = render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1)
-            write_colmap(project, images)
+            photographs(project)
         options["report"](FEATURES, 1, 4)
         return FoundCameras(project, 5, ("4.png",), 40, 0.5)
 
@@ -65,8 +70,7 @@ def test_points_are_found_and_few_are_said(tmp_path, monkeypatch, capsys):
         report(FEATURES, 1, 4)
         return FoundPoints(Path(project), 4, 40, 0.5)
 
-    photos, project, said = tmp_path / "photos", tmp_path / "project", tmp_path / "said.json"
-    write_colmap(photos, render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1))
+    photos, project, said = photographs(tmp_path / "photos"), tmp_path / "project", tmp_path / "said.json"
     with monkeypatch.context() as patch:
         patch.setattr("mplicits.datasets.views.poses.find_points.find_points", find)
         assert main(f"find-points {photos} -o {project} --json {said} --quiet".split()) == 0
@@ -95,9 +99,7 @@ def test_steps_that_could_not_be_recorded_are_said(tmp_path, monkeypatch, capsys
         return ReplayedTrainer(objective, recorder=Refusing(), stage="reconstruct", steps=config.steps)
 
     monkeypatch.setattr(train, "scene_trainer", on_a_gpu)
-    project = tmp_path / "project"
-    write_colmap(project, render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1))
-    run = tmp_path / "run"
+    project, run = photographs(tmp_path / "project"), tmp_path / "run"
     assert main(f"reconstruct {project} -o {run} {TINY} --start sphere".split()) == 0
     assert "no memory for graphs" in capsys.readouterr().err
     record = json.loads((run / "run.json").read_text())

@@ -36,12 +36,9 @@ def finished(tmp_path_factory) -> Path:
 
 def test_a_travelling_sphere_is_learnt():
     field = evolve(QUICK).field
-    truth = Moving(Sphere(radius=0.4, center=(-0.2, 0.0, 0.0)), TRAVEL)
     points = torch.nn.functional.normalize(torch.randn(3000, 3), dim=1) * 0.4 + torch.tensor([-0.2, 0.0, 0.0])
     time = torch.rand(3000)
-    x = TRAVEL.forward(points, time)
-    assert truth.value(at_time(x, time)).abs().max() < 1e-5
-    assert field.value(at_time(x, time)).abs().mean() < 5e-3
+    assert field.value(at_time(TRAVEL.forward(points, time), time)).abs().mean() < 5e-3
     assert slope_figures(field)["mean"] == pytest.approx(1, abs=0.05)
 
 
@@ -180,7 +177,6 @@ def test_a_yaml_file_on_the_command_line(tmp_path, capsys):
     ("arguments", "message"),
     [
         ("-o RUN", "no shapes to evolve"),
-        ("sphere -o RUN", "1 shapes for kind morph; expected at least 2"),
         ("sphere nothing -o RUN", "nothing: no such run directory or file"),
         ("sphere torus --shapes box -o RUN", "--shapes: the shapes are given already"),
         ("sphere -o RUN --resume", "--resume: continues with the run's own settings"),

@@ -72,7 +72,6 @@ def test_a_report_without_a_unit_and_of_an_open_mesh():
 
 
 def test_volume_parts_and_normals_are_those_of_the_mesh_wherever_it_is():
-    """Two balls, one of them in 1 % of the other's volume, at map coordinates."""
     field = Union(Sphere(radius=0.5, center=(-0.4, 0, 0)), Sphere(radius=0.1, center=(0.6, 0, 0)))
     mesh = extract_mesh(field, resolution=64)
     far = Similarity((5e6, -4e5, 300.0), 3.0)

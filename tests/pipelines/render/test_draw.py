@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,11 +86,16 @@ def write_transforms(path: Path, cameras: dict[str, Camera]) -> None:
     path.write_text(json.dumps({"frames": frames}))
 
 
-def render(shapes: Path, source: str, out: Path, *arguments: str) -> np.ndarray:
+@pytest.fixture
+def draw(shapes, tmp_path) -> Callable[..., np.ndarray]:
     """The picture that the command draws, small unless it is told otherwise."""
-    size = [] if "--size" in arguments or "--cameras" in arguments else ["--size", "24"]
-    assert main(["render", str(shapes / source), "-o", str(out), *size, *arguments]) == 0
-    return iio.imread(out).astype(float)
+
+    def run(source: str, flags: str, name: str = "a.png") -> np.ndarray:
+        size = "" if "--size" in flags or "--cameras" in flags else "--size 24"
+        assert main(f"render {shapes / source} -o {tmp_path / name} {size} {flags}".split()) == 0
+        return iio.imread(tmp_path / name).astype(float)
+
+    return run
 
 
 def blob_gradient(positions: torch.Tensor) -> torch.Tensor:
@@ -188,15 +194,14 @@ def test_a_field_and_its_mesh_are_seen_alike():
 
 
 @pytest.mark.parametrize("shading", SHADINGS)
-def test_every_shading_of_a_field_and_of_its_mesh(shapes, tmp_path, shading):
-    arguments = ("--shading", shading, "--no-legend", "--fast", "--size", "40")
+def test_every_shading_of_a_field_and_of_its_mesh(shapes, draw, shading):
+    flags = f"--shading {shading} --no-legend --fast --size 40"
     pictures = []
     if shading != "color":
-        pictures.append(render(shapes, "blob.safetensors", tmp_path / "field.png", *arguments))
+        pictures.append(draw("blob.safetensors", flags))
     if shading != "curvature":
-        source = "mesh.ply" if shading == "color" else "plain.obj"
-        reference = ("--reference", str(shapes / "cloud.ply")) if shading == "error" else ()
-        pictures.append(render(shapes, source, tmp_path / "mesh.png", *arguments, *reference))
+        reference = f"--reference {shapes}/cloud.ply" if shading == "error" else ""
+        pictures.append(draw("mesh.ply" if shading == "color" else "plain.obj", f"{flags} {reference}"))
     for picture in pictures:
         assert picture.shape == (40, 40, 3)
         assert 0.3 < (picture < 250).any(axis=2).mean() < 0.7
@@ -207,29 +212,24 @@ def test_every_shading_of_a_field_and_of_its_mesh(shapes, tmp_path, shading):
         assert np.abs(pictures[0][20, 20] - (51, 153, 102)).max() <= 1
 
 
-def test_normals_are_drawn_as_colours_of_the_right_pixels(shapes, tmp_path, blob):
-    picture = render(
-        shapes, "blob.safetensors", tmp_path / "a.png", "--shading", "normals", "--samples", "1", "--size", "48", "32"
-    )
+def test_normals_are_drawn_as_colours_of_the_right_pixels(shapes, draw, blob):
+    picture = draw("blob.safetensors", "--shading normals --samples 1 --size 48 32")
     subject = open_subject(shapes / "blob.safetensors")
     seen = trace_view(blob, orbit(subject.outline(), width=48, height=32))
     normals = normalize(blob_gradient(seen.position), dim=1)
     assert np.abs(picture.reshape(-1, 3)[seen.pixel] - (normals.numpy() + 1) * 127.5).max() < 1
 
 
-def test_shadows_and_occlusion_are_on_for_fields_and_can_be_left_out(shapes, tmp_path):
-    pictures = {
-        flags: render(shapes, "blob.safetensors", tmp_path / "a.png", "--samples", "1", *flags.split())
-        for flags in ("", "--no-shadows", "--no-occlusion", "--fast", "--fast --shadows --occlusion")
-    }
+def test_shadows_and_occlusion_are_on_for_fields_and_can_be_left_out(draw):
+    flags = ("", "--no-shadows", "--no-occlusion", "--fast", "--fast --shadows --occlusion")
+    pictures = {each: draw("blob.safetensors", f"--samples 1 {each}") for each in flags}
     assert (pictures[""] == pictures["--fast --shadows --occlusion"]).all()
     assert pictures["--fast"].mean() >= pictures["--no-shadows"].mean() >= pictures[""].mean() - 1e-9
     assert (pictures["--no-shadows"] != pictures["--fast"]).any()
 
 
-def test_strips_do_not_show(shapes, tmp_path, monkeypatch):
-    arguments = ("--shading", "depth", "--levels")
-    whole = render(shapes, "blob.safetensors", tmp_path / "a.png", *arguments)
+def test_strips_do_not_show(shapes, draw, tmp_path, monkeypatch):
+    whole = draw("blob.safetensors", "--shading depth --levels")
     monkeypatch.setattr(trace, "STRIP", 24 * 4 * 5)
     steps = []
     options = RenderOptions(size=(24,), shading="depth", levels=True)
@@ -238,23 +238,23 @@ def test_strips_do_not_show(shapes, tmp_path, monkeypatch):
     assert steps == [(done, 10) for done in range(1, 11)]  # two levels of five strips
 
 
-def test_a_transparent_picture_covers_what_the_shape_does(shapes, tmp_path):
-    clear, coarse = ("--background", "transparent"), ("--size", "30", "--samples", "4")
-    picture = render(shapes, "mesh.ply", tmp_path / "a.png", *clear, "--shading", "color", *coarse)
+def test_a_transparent_picture_covers_what_the_shape_does(draw):
+    flags = "--background transparent --size 30 --samples 4"
+    picture = draw("mesh.ply", f"{flags} --shading color")
     assert picture.shape == (30, 30, 4)
-    fine = render(shapes, "mesh.ply", tmp_path / "b.png", *clear, "--size", "240", "--samples", "1")
+    fine = draw("mesh.ply", "--background transparent --size 240 --samples 1")
     assert picture[..., 3].mean() == pytest.approx(fine[..., 3].mean(), rel=0.005)
     rim = (picture[..., 3] > 20) & (picture[..., 3] < 235)
     assert np.abs(picture[rim][:, :3] - (51, 153, 102)).max() <= 2  # nothing of a background in it
-    traced = render(shapes, "blob.safetensors", tmp_path / "c.png", *clear, "--fast", *coarse)
+    traced = draw("blob.safetensors", f"{flags} --fast")
     assert np.abs(traced[..., 3] - picture[..., 3]).mean() < 0.5
 
 
 @pytest.mark.parametrize(("shading", "power"), [("depth", 1), ("curvature", -1)])
-def test_limits_and_legends_are_in_input_units(shapes, tmp_path, capsys, shading, power):
+def test_limits_and_legends_are_in_input_units(shapes, draw, capsys, shading, power):
     limits = []
     for name in ("unit.safetensors", "blob.safetensors"):
-        picture = render(shapes, name, tmp_path / "a.png", "--shading", shading)
+        picture = draw(name, f"--shading {shading}")
         said = capsys.readouterr().out
         limits.append([float(number) for number in said.split(" from ")[1].split(",")[0].split(" to ")])
     assert limits[1] == pytest.approx([SCALE**power * limit for limit in limits[0]], rel=1e-3)
@@ -265,9 +265,9 @@ def test_limits_and_legends_are_in_input_units(shapes, tmp_path, capsys, shading
     else:
         assert limits[1][0] == -limits[1][1]
     low, high = limits[1]
-    arguments = ("--shading", shading, "--limits", str(low), str(high))
-    assert np.abs(render(shapes, name, tmp_path / "b.png", *arguments) - picture)[:24].mean() < 0.5
-    wide = render(shapes, name, tmp_path / "c.png", "--shading", shading, "--limits", "-1000", "1000")
+    given = draw(name, f"--shading {shading} --limits {low} {high}")
+    assert np.abs(given - picture)[:24].mean() < 0.5
+    wide = draw(name, f"--shading {shading} --limits -1000 1000")
     assert np.ptp(wide[10:14, 10:14], axis=(0, 1)).max() < 12  # all of it in the middle of the map
 
 
@@ -284,42 +284,38 @@ def test_the_error_is_the_distance_between_surfaces(shapes):
     assert torch.allclose(meshed, gap, rtol=0.1)
 
 
-def test_levels_stand_side_by_side(shapes, tmp_path, capsys):
-    picture = render(shapes, "blob.safetensors", tmp_path / "a.png", "--levels", "--shading", "headlight")
+def test_levels_stand_side_by_side(draw, capsys):
+    picture = draw("blob.safetensors", "--levels --shading headlight")
     assert picture.shape == (24 + 40, 3 * (24 + 12), 3)
     assert "level 0, level 1, level 0 + normals of level 1" in capsys.readouterr().out
     ink = [(picture[40:, start : start + 36] < 250).any(axis=2).sum() for start in (0, 36, 72)]
     assert ink[0] == ink[2] >= ink[1]
-    one = render(shapes, "blob.safetensors", tmp_path / "b.png", "--level", "0", "--shading", "headlight")
-    assert (picture[40:, 6:30] == one).all()
+    assert (picture[40:, 6:30] == draw("blob.safetensors", "--level 0 --shading headlight")).all()
 
 
-def test_sides_stand_side_by_side_as_they_look_alone(shapes, tmp_path, capsys):
-    plain = ("--shading", "normals", "--azimuth", "100")
-    picture = render(shapes, "blob.safetensors", tmp_path / "a.png", *plain, "--sides", "4")
+def test_sides_stand_side_by_side_as_they_look_alone(draw, capsys):
+    picture = draw("blob.safetensors", "--shading normals --azimuth 100 --sides 4")
     assert "level 1, normals, 24×24, 4 sides" in capsys.readouterr().out
     assert picture.shape == (24 + 40, 4 * (24 + 12), 3)
     tiles = [picture[40:, 36 * side + 6 : 36 * side + 30] for side in range(4)]
-    azimuths = ("100", "-170", "-80", "10")
-    alone = [render(shapes, "blob.safetensors", tmp_path / "b.png", *plain[:3], azimuth) for azimuth in azimuths]
+    alone = [draw("blob.safetensors", f"--shading normals --azimuth {each}") for each in (100, -170, -80, 10)]
     # All stand as far off as the one that must stand furthest, which looks as it does alone; the others are smaller.
     assert any((tile == one).all() for tile, one in zip(tiles, alone, strict=True))
     assert max(np.abs(tile[12, 12] - one[12, 12]).max() for tile, one in zip(tiles, alone, strict=True)) < 40
     assert min(np.abs(tiles[a] - tiles[b]).mean() for a in range(4) for b in range(a)) > 5
-    both = render(shapes, "blob.safetensors", tmp_path / "c.png", *plain, "--sides", "3", "--levels")
+    both = draw("blob.safetensors", "--shading normals --sides 3 --levels")
     assert both.shape == (3 * (24 + 40), 3 * (24 + 12), 3)  # two levels, and one with the other's normals
 
 
 @pytest.mark.parametrize("source", ["blob.safetensors", "plain.obj"])
-def test_posed_cameras_are_in_input_coordinates(shapes, tmp_path, source):
-    around = ("--azimuth", "50", "--elevation", "30", "--fov", "20", "--size", "40", "30")
-    plain = render(shapes, "plain.obj", tmp_path / "a.png", "--shading", "normals", *around)
-    cameras = ("--shading", "normals", "--cameras", str(shapes / "transforms.json"), "--frame")
-    posed = render(shapes, source, tmp_path / "b.png", *cameras, "a")
+def test_posed_cameras_are_in_input_coordinates(shapes, draw, source):
+    plain = draw("plain.obj", "--shading normals --azimuth 50 --elevation 30 --fov 20 --size 40 30")
+    cameras = f"--shading normals --cameras {shapes}/transforms.json --frame"
+    posed = draw(source, f"{cameras} a")
     assert posed.shape == (30, 40, 3)
     assert np.abs(posed - plain).mean() < 1
-    assert render(shapes, source, tmp_path / "b.png", *cameras, "b").shape == (36, 48, 3)
-    assert render(shapes, source, tmp_path / "b.png", *cameras, "b", "--size", "16").shape == (12, 16, 3)
+    assert draw(source, f"{cameras} b").shape == (36, 48, 3)
+    assert draw(source, f"{cameras} b --size 16").shape == (12, 16, 3)
 
 
 def test_frames_are_chosen_by_name_or_index():
@@ -333,19 +329,17 @@ def test_frames_are_chosen_by_name_or_index():
             choose_frame("c.json", named, frame)
 
 
-def test_clouds_are_drawn_as_their_surface_without_gaps(shapes, tmp_path):
-    mesh, discs = (render(shapes, name, tmp_path / "a.png", "--size", "60") for name in ("plain.obj", "cloud.ply"))
+def test_clouds_are_drawn_as_their_surface_without_gaps(draw):
+    mesh, discs, bare = (draw(name, "--size 60") for name in ("plain.obj", "cloud.ply", "bare.xyz"))
     meshed, covered = ((picture < 250).any(axis=2) for picture in (mesh, discs))
     assert (meshed & ~covered).sum() < 10
     assert covered.sum() < 1.15 * meshed.sum()
     assert np.median(np.abs(mesh - discs)[meshed & covered]) < 8
-    bare = render(shapes, "bare.xyz", tmp_path / "c.png", "--size", "60")
     assert bare.shape[0] > 60  # the legend of depths: points without normals have no shade
 
 
-def test_turntables_have_the_frames_asked_for_and_one_scale_of_colours(shapes, tmp_path):
-    arguments = ("--frames", "5", "--fps", "10", "--samples", "1", "--shading", "depth")
-    frames = render(shapes, "blob.safetensors", tmp_path / "a.gif", "--size", "48", *arguments)
+def test_turntables_have_the_frames_asked_for_and_one_scale_of_colours(draw):
+    frames = draw("blob.safetensors", "--size 48 --frames 5 --fps 10 --samples 1 --shading depth", "a.gif")
     assert len(frames) == 5
     legends = frames[:, 48:]
     assert legends.shape[1] > 0
@@ -354,10 +348,10 @@ def test_turntables_have_the_frames_asked_for_and_one_scale_of_colours(shapes, t
 
 
 def test_a_film_goes_through_posed_cameras(shapes, tmp_path):
-    cameras = ("--cameras", str(shapes / "even.json"), "--fast")
     camera = orbit(SIMILARITY.to_input(open_subject(shapes / "unit.safetensors").outline()), width=32, height=32)
     write_transforms(shapes / "even.json", {"a": camera, "b": camera, "c": camera})
-    assert main(["render", str(shapes / "plain.obj"), "-o", str(tmp_path / "a.mp4"), *cameras]) == 0
+    line = f"render {shapes}/plain.obj -o {tmp_path}/a.mp4 --cameras {shapes}/even.json --fast"
+    assert main(line.split()) == 0
     assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
 
 
@@ -372,11 +366,10 @@ def test_an_interruption_leaves_what_was_there(shapes, tmp_path, name):
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {name: "old"}
 
 
-def test_it_says_when_nothing_is_in_view(shapes, tmp_path, capsys):
+def test_it_says_when_nothing_is_in_view(draw, tmp_path, capsys):
     away = look_at((1000.0, 0.0, 0.0), (2000.0, 0.0, 0.0), width=8, height=8)
     write_transforms(tmp_path / "away.json", {"a": away})
-    picture = render(shapes, "blob.safetensors", tmp_path / "a.png", "--cameras", str(tmp_path / "away.json"))
-    assert (picture == 255).all()
+    assert (draw("blob.safetensors", f"--cameras {tmp_path}/away.json") == 255).all()
     assert "nothing of it is in view" in capsys.readouterr().out
 
 

@@ -112,7 +112,6 @@ def test_a_raking_light_shows_a_degree():
 
 @pytest.mark.parametrize("shading", ["lambert", "headlight", "raking", "matcap", "depth"])
 def test_lamps_and_matcaps_turn_with_the_camera(shading):
-    """A sphere looks the same from everywhere."""
     pictures = []
     for eye in (EYE, (4.0, 0.0, 0.0), (1.2, 3.0, -2.2)):
         camera = camera_at(tuple(np.asarray(eye) / np.linalg.norm(eye) * 4))

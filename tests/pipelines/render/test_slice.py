@@ -132,7 +132,6 @@ def test_the_tint_covers_exactly_the_band():
 
 
 def test_each_level_has_its_own_line_and_an_inner_band_ends_with_the_outer_one():
-    """Concentric spheres with bands: all radii are known."""
     field = MultiscaleSDF(Sphere(radius=0.5), [_Constant(0.04), _Constant(-0.08)], [0.2, 0.1])
     view = {**ACROSS_Z, "half_size": 401 * 0.0025, "size": (401, 401)}  # a pixel is 0.005, one is in the middle
     taken = take_slice(field, **view)

@@ -173,7 +173,6 @@ def test_what_a_person_sees_and_does(opened):
 
 
 def test_at_rest_the_picture_is_refined(browser, page):
-    """Strip by strip, to rays of the size that was asked for, and then to nothing finer."""
     browser.get(f"{page.as_uri()}?pixel=4&camera=10,80&webgl")
     until(lambda: browser.execute_script("return document.documentElement.dataset.finished"))
     width, height = browser.execute_script("return [innerWidth, innerHeight]")
@@ -193,7 +192,6 @@ def test_a_lost_context_is_told_and_comes_back(opened):
 
 @pytest.mark.parametrize("kind", ["WebGPU"], indirect=True)
 def test_a_lost_device_is_replaced(opened):
-    """By another, whose picture is the same to the last bit."""
     camera, _ = cameras()["around"]
     before, _ = rendered(opened, camera, level=0)
     opened.execute_script("window.mplicits.renderer.tracer.device.destroy()")

@@ -29,7 +29,6 @@ def test_the_page_comes_with_the_first_checkpoint_of_this_run(tmp_path):
 
 
 def test_what_fails_is_said_once_and_no_more(tmp_path, monkeypatch):
-
     def fail(*_: object, **__: object) -> object:
         raise RuntimeError("no such screen")
 
@@ -42,7 +41,6 @@ def test_what_fails_is_said_once_and_no_more(tmp_path, monkeypatch):
 
 
 def test_a_fit_is_watched(tmp_path, capsys):
-    """With nobody connected, and with the same result."""
     write_cloud_ply(tmp_path / "ball.ply", sample_sphere(500))
     runs = [tmp_path / "plain", tmp_path / "watched"]
     for run, watch in zip(runs, ("", "--watch"), strict=True):
