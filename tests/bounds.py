@@ -27,12 +27,12 @@ def unit_roundoff(dtype: torch.dtype) -> float:
 def rounding(field: Module, x: Tensor, evaluate: Callable[[Module, Tensor], Sequence[Tensor]]) -> list[Tensor]:
     """A bound on the rounding errors of results that are computed in the precision of ``x``, entry by entry.
 
-    A sum of n products, in any order, is the exact sum of weights that are changed relatively by at most
-    γ_n = n u / (1 − n u) each (Higham 2002, Sec. 3.1). Rounded points, biases and sines are much the same. So a network
-    in floating point is an exact network of other weights, at another point. The effect is measured in float64: all
-    parameters and coordinates are multiplied by 1 ± ε with random signs, and the change of the result is divided by ε
-    and multiplied by n u. A result that changes by little in all draws gets the median change of all results. Where a
-    gate opens or a box has an edge within ε, the bound is as large as the jump.
+    A sum of n products, in any order, is the exact sum for weights that differ by at most γ_n = n u / (1 − n u) each
+    (Higham 2002, Sec. 3.1). Rounded points, biases and sines are much the same. So a network in floating point is an
+    exact network of other weights, at another point. The effect is measured in float64. All parameters and coordinates
+    are multiplied by 1 ± ε with random signs; the change of the result is divided by ε and multiplied by n u. A result
+    that changes by little in all draws gets the median change of all results. Where a gate opens or a box has an edge
+    within ε, the bound is as large as the jump.
 
     Returns:
         A bound for each entry of each result of ``evaluate(field, x)``, in float64, on the CPU.

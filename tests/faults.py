@@ -1,8 +1,8 @@
 """A disk that fails, or a process that is killed, at a chosen operation of `neural_fields.backend.files`.
 
-- "killed": that operation and all after it do not happen, as after SIGKILL or a power cut;
-- "torn": half of it happens, if it is a write, and nothing after it;
-- "full": it raises that the disk is full, once; what follows works.
+- "killed": that operation and all after it do not happen, as after SIGKILL or a power cut.
+- "torn": half of it happens, if it is a write, and nothing after it.
+- "full": it raises that the disk is full, once. What follows works.
 """
 
 from __future__ import annotations

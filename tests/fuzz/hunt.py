@@ -83,7 +83,7 @@ def outcome_of(number: int, specimen: Specimen, data: bytes, folder: Path) -> Ou
 
 @contextlib.contextmanager
 def _limits(size: int) -> Iterator[None]:
-    """So many seconds and so much memory, for the block."""
+    """Limits on the seconds and the memory of the block."""
 
     def stop(*_: object) -> None:
         raise _Hang

@@ -19,7 +19,7 @@ ENCODED = "ours, 256 features"  # the other such rows have as many without an en
 
 
 def set_up(args: argparse.Namespace, clone: Path, scene: Path, row: str, folder: Path) -> None:
-    """A copy of the host in ``folder``, changed for one row, with the schedule squeezed into so many steps."""
+    """A copy of the host in ``folder``, changed for one row, with the schedule squeezed into the given steps."""
     shutil.copytree(clone, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("exp", ".git"))
     runner, conf = folder / "exp_runner.py", folder / "confs" / "wmask.conf"
     wanted = [change for change in changes("NeuS") if row != "host" or "weights_only" in change[1]]

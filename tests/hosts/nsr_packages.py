@@ -160,7 +160,7 @@ class LightningModule(nn.Module):
     global_step, current_epoch, trainer = 0, 0, None
 
     def log(self, name: str, value: object, **_settings: object) -> None:
-        """Lightning's loggers; nobody reads them here."""
+        """Lightning's loggers are not read here."""
 
 
 def install() -> None:

@@ -2,8 +2,8 @@
 
 PyTorch lends a device type to backends ("PrivateUse1"); here it is ``standin``. Its tensors are shells of tensors of
 the CPU, so that results are the CPU's to the last bit. Each operation on shells comes to `_run`, which counts launches
-and waits (`ledger.py`) and refuses what CUDA refuses: operands on two devices, generators of another device,
-`.numpy()`, and copies to the host that do not wait. It cannot show other roundings, races of streams, or time.
+and waits (`ledger.py`). It refuses operands on two devices, generators of another device, `.numpy()`, and copies to
+the host that do not wait. It cannot show other roundings, races of streams, or time.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ def _note(operation: _Operation, args: Any, kwargs: Any) -> None:
             if not isinstance(index, StandInTensor):
                 note_wait("upload")
         masks = [index for index in indices if index.dtype in (torch.bool, torch.uint8)]
-        # One mask and one number: that is a masked fill, whose size nobody has to know.
+        # One mask and one number: that is a masked fill, whose size does not matter.
         if masks and not (len(indices) == 1 and "put" in name and args[2].ndim == 0):
             note_launch("nonzero")
             note_wait("size")

@@ -20,8 +20,8 @@ class Ledger:
     """Counts of one workload.
 
     Attributes:
-        waits: how often the host waited, by reason and line: ``item`` (a number is read), ``size`` (the shape of a
-            result depends on numbers), ``download`` or ``upload`` (a copy to or from the host that blocks).
+        waits: how often the host waited, by reason and line. Reasons are ``item`` (a number is read), ``size`` (a
+            shape depends on numbers), ``download`` and ``upload`` (copies to and from the host that block).
         launches: kernels by name of the operation, one each; views and allocations launch none.
     """
 
@@ -46,7 +46,7 @@ _open: list[Ledger] = []
 
 @contextmanager
 def counted() -> Iterator[Ledger]:
-    """Count what is asked of the device inside the ``with``; ledgers may be open inside each other."""
+    """Count launches and waits inside the ``with``; ledgers may be open inside each other."""
     ledger = Ledger()
     _open.append(ledger)
     try:

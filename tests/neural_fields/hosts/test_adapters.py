@@ -3,20 +3,12 @@
 import enum
 from collections.abc import Callable, Iterable
 
+import mplicits.neural_fields as nf
 import pytest
 import torch
 from bounds import assert_within, rounding
 from fields import small_multiscale
 from hosts import Heads, NeuSHost, OldHeads, Separate, points, ray_samples, rays
-from mplicits.neural_fields import (
-    Field,
-    InstantNSRGeometry,
-    MultiscaleSDF,
-    NerfstudioField,
-    NeuSGeometry,
-    Siren,
-    Sphere,
-)
 from mplicits.neural_fields.networks.colors import ViewColor
 from mplicits.neural_fields.volume.weights import transmittance_weights
 from torch import Tensor, nn
@@ -38,10 +30,10 @@ def assert_three_steps_lower(loss: Callable[[], Tensor], parameters: Iterable[nn
     assert losses[2] < losses[0]
 
 
-def neus(*, scale: float = 1.0, double: bool = False) -> tuple[NeuSGeometry, Counted]:
+def neus(*, scale: float = 1.0, double: bool = False) -> tuple[nf.NeuSGeometry, Counted]:
     """A shell around a tapered field with two features, and the counter inside it."""
     field = Counted(small_multiscale(0.5))
-    shell = NeuSGeometry(field.double() if double else field, scale=scale)
+    shell = nf.NeuSGeometry(field.double() if double else field, scale=scale)
     return shell, field
 
 
@@ -62,18 +54,14 @@ def test_neus_step_costs_one_jet_per_sample_and_values_elsewhere() -> None:
 
 
 def test_neus_step_has_the_gradients_of_separate_evaluations() -> None:
-    torch.set_default_dtype(torch.float64)
-    try:
-        field = small_multiscale(0.5)
-        hosts = [NeuSHost(NeuSGeometry(field), 2), NeuSHost(Separate(field), 2)]
-        hosts[1].color = hosts[0].color
-        origins, directions, depths, wanted = rays()
-        found = []
-        for host in hosts:
-            loss = host.loss(origins, directions, host.finer_depths(origins, directions, depths), wanted)
-            found.append(torch.autograd.grad(loss, host.parameters()))
-    finally:
-        torch.set_default_dtype(torch.float32)
+    field = small_multiscale(0.5).double()
+    hosts = [NeuSHost(geometry, 2) for geometry in (nf.NeuSGeometry(field), Separate(field))]
+    hosts[1].color = hosts[0].color.double()
+    origins, directions, depths, wanted = (part.double() for part in rays())
+    found = []
+    for host in hosts:
+        loss = host.loss(origins, directions, host.finer_depths(origins, directions, depths), wanted)
+        found.append(torch.autograd.grad(loss, host.parameters()))
     torch.testing.assert_close(*found, rtol=1e-10, atol=1e-12)
 
 
@@ -109,9 +97,9 @@ def test_curvature_is_known_at_points_that_were_marked_late() -> None:
     assert x.grad is not None
 
 
-def nsr(**options: float) -> tuple[InstantNSRGeometry, Counted]:
+def nsr(**options: float) -> tuple[nf.InstantNSRGeometry, Counted]:
     field = Counted(small_multiscale(0.5))
-    return InstantNSRGeometry(field, **options), field
+    return nf.InstantNSRGeometry(field, **options), field
 
 
 def test_instant_nsr_returns_what_the_flags_ask_for() -> None:
@@ -135,7 +123,7 @@ def test_instant_nsr_returns_what_the_flags_ask_for() -> None:
 
 def test_laplacian_of_a_sphere() -> None:
     x = normalize(points(40, torch.float64), dim=-1) * torch.linspace(0.6, 1.4, 40, dtype=torch.float64)[:, None]
-    geometry = InstantNSRGeometry(Sphere(radius=0.5), radius=1.5)
+    geometry = nf.InstantNSRGeometry(nf.Sphere(radius=0.5), radius=1.5)
     sdf, laplace = geometry(x, with_grad=False, with_feature=False, with_laplace=True)
     torch.testing.assert_close(laplace, 2 / x.norm(dim=-1), rtol=0, atol=1e-10)
     torch.testing.assert_close(sdf, x.norm(dim=-1) - 0.75)
@@ -171,16 +159,16 @@ def test_instant_nsr_training_and_validation() -> None:
 
 
 def test_instant_nsr_mesh_is_in_the_hosts_units() -> None:
-    geometry = InstantNSRGeometry(Sphere(radius=0.3), radius=1.5, scale=0.4, resolution=32)
+    geometry = nf.InstantNSRGeometry(nf.Sphere(radius=0.3), radius=1.5, scale=0.4, resolution=32)
     mesh = geometry.isosurface()
     assert geometry.forward_level(torch.tensor([[1.5, 0.0, 0.0]])).tolist() == [0.75]
     assert (mesh["t_pos_idx"].dtype, mesh["v_pos"].dtype) == (torch.int64, torch.float32)
     assert bool(((mesh["v_pos"].norm(dim=-1) - 0.75).abs() < 5e-3).all())
 
 
-def studio(heads: type[enum.Enum] = Heads) -> tuple[NerfstudioField, Counted]:
+def studio(heads: type[enum.Enum] = Heads) -> tuple[nf.NerfstudioField, Counted]:
     field = Counted(small_multiscale(0.5))
-    return NerfstudioField(field, ViewColor(2, width=16, depth=1), heads=heads, deviation=0.3), field
+    return nf.NerfstudioField(field, ViewColor(2, width=16, depth=1), heads=heads, deviation=0.3), field
 
 
 def test_nerfstudio_step_costs_one_jet_per_sample() -> None:
@@ -237,11 +225,11 @@ def test_nerfstudio_names_of_either_host() -> None:
     assert shell.deviation_network(torch.zeros(4, 3)).shape == (4, 1)
 
 
-def shells(field: Field, **options: float) -> list:
+def shells(field: nf.Field, **options: float) -> list:
     return [
-        NeuSGeometry(field, **options),
-        InstantNSRGeometry(field, **options),
-        NerfstudioField(field, ViewColor(0, width=8, depth=1), heads=Heads, **options),
+        nf.NeuSGeometry(field, **options),
+        nf.InstantNSRGeometry(field, **options),
+        nf.NerfstudioField(field, ViewColor(0, width=8, depth=1), heads=Heads, **options),
     ]
 
 
@@ -260,8 +248,8 @@ def test_without_a_graph_features_cost_a_value() -> None:
 def test_scale_comes_from_the_box() -> None:
     box = torch.tensor([[-1.0, -2.0, -2.0], [0.5, 1.0, 2.0]])
     for shell in (
-        NeuSGeometry(Sphere(), bounds=box),
-        NerfstudioField(Sphere(), ViewColor(0, width=8, depth=1), heads=Heads, bounds=box),
+        nf.NeuSGeometry(nf.Sphere(), bounds=box),
+        nf.NerfstudioField(nf.Sphere(), ViewColor(0, width=8, depth=1), heads=Heads, bounds=box),
     ):
         assert shell.scale == pytest.approx(1 / 3, rel=1e-15)  # its farthest corner is (-1, -2, ±2)
         assert shell.bounds == ((-1.0, -2.0, -2.0), (0.5, 1.0, 2.0))
@@ -272,7 +260,7 @@ def test_scale_comes_from_the_box() -> None:
 def test_meshes_are_in_the_hosts_units_within_its_box() -> None:
     """Marching cubes with a Newton step on a sphere: no vertex is farther off than the sagitta of a cell."""
     resolution, radius = 32, 0.5 / 0.7
-    for shell in shells(Sphere(radius=0.5), scale=0.7):
+    for shell in shells(nf.Sphere(radius=0.5), scale=0.7):
         cell = (shell.bounds[1][0] - shell.bounds[0][0]) / resolution
         off = (shell.mesh(resolution).vertices ** 2).sum(axis=1) ** 0.5 - radius
         assert abs(off).max() < cell**2 / radius
@@ -281,7 +269,7 @@ def test_meshes_are_in_the_hosts_units_within_its_box() -> None:
 
 
 def test_bands_follow_the_uncertainty_of_the_surface() -> None:
-    for shell in shells(MultiscaleSDF(Sphere(), [Siren(8, 1), Siren(8, 1)], [0.3, 0.3]), scale=0.5):
+    for shell in shells(nf.MultiscaleSDF(nf.Sphere(), [nf.Siren(8, 1), nf.Siren(8, 1)], [0.3, 0.3]), scale=0.5):
         for inv_s, delta in ((2.0, 0.3), (torch.full((3, 1), 40.0), 0.05), (1e4, 0.02)):
             shell.follow(inv_s)
             assert shell.field.deltas.tolist() == pytest.approx([delta, delta])
@@ -290,7 +278,7 @@ def test_bands_follow_the_uncertainty_of_the_surface() -> None:
     shell, _ = studio()
     shell.follow()
     assert shell.field.deltas.tolist() == pytest.approx([4 / 20.0855] * 2, rel=1e-4)
-    for plain in shells(Sphere()):
+    for plain in shells(nf.Sphere()):
         plain.follow(10.0)  # nothing to narrow
 
 

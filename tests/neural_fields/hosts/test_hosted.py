@@ -73,7 +73,7 @@ def test_a_change_between_the_calls_is_seen(change: str) -> None:
     assert len(output) == 50
 
 
-# What happens to an output before the gradient is asked for, and how many points get a jet in all.
+# What happens to an output before the call of the gradient, and the number of jets in all.
 BETWEEN: dict[str, tuple[Callable[[Tensor, Tensor], object], int]] = {
     "nothing": (lambda output, x: None, 50),
     "the points are marked": (lambda output, x: x.requires_grad_(), 50),

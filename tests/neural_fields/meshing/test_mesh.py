@@ -82,7 +82,7 @@ def test_stl_far_away_is_refused_unless_it_is_centred(tmp_path):
 
 @pytest.mark.parametrize("similarity", [NEAR, FAR], ids=["near", "far"])
 def test_a_glb_is_upright_in_metres_and_centred_in_its_scene(similarity, tmp_path):
-    """As another reader sees it, which knows nothing of us but the standard."""
+    """As trimesh reads it."""
     mesh = tower(similarity)
     path = tmp_path / "mesh.glb"
     mesh.export(path, up="z", unit="mm", center=True)

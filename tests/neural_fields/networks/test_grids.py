@@ -84,7 +84,7 @@ def test_tables_are_told_from_all_other_parameters() -> None:
 
 
 def some_points(count: int = 500) -> Tensor:
-    """In the unit ball, of which alone the grid keeps values."""
+    """In the unit ball; the grid has no values outside it."""
     points = torch.nn.functional.normalize(torch.randn(count, 3), dim=1)
     return torch.rand(count, 1) ** (1 / 3) * points
 

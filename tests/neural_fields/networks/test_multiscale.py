@@ -157,7 +157,7 @@ def test_no_other_output_is_nearer() -> None:
     misses = (jet.value - lengths[:, 0] + 0.35).square() + 0.1 * (jet.gradient - direction).square().sum(dim=1)
     total = misses.sum() + 1e-6 * count * network.output.weight[0].square().sum()
     slope = torch.autograd.grad(total, [network.output.weight, network.output.bias])
-    # Sums of so many terms, each below one.
+    # Sums of `count` terms, each below one.
     bound = 1e4 * float(total.detach()) * count * torch.finfo(torch.float64).eps
     assert max(float(part[0].abs().max()) for part in slope) < bound
 

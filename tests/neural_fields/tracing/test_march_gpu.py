@@ -1,5 +1,7 @@
 """The march that runs ahead of the host, on the CPU, against the one that looks after every pass."""
 
+from unittest import mock
+
 import pytest
 import torch
 from fields import FIELDS, Watched, assert_depths, small_multiscale
@@ -14,19 +16,13 @@ from waits import some_rays, three_levels
 CLOSED = {"sphere": Sphere(radius=0.5), "torus": Torus(major=0.5, minor=0.2)}
 
 
-@pytest.fixture
-def both(monkeypatch: pytest.MonkeyPatch):
+def both(work, *arguments, **options):
     """Call a function with the one march and with the other."""
-
-    def call(work, *arguments, **options):
-        found = []
-        for ahead in (False, True):
-            with monkeypatch.context() as patch:
-                patch.setattr(tracing, "makes_wait", lambda _, ahead=ahead: ahead)
-                found.append(work(*arguments, **options))
-        return found
-
-    return call
+    found = []
+    for ahead in (False, True):
+        with mock.patch.object(tracing, "makes_wait", return_value=ahead):
+            found.append(work(*arguments, **options))
+    return found
 
 
 def rays(dtype: torch.dtype, count: int = 200) -> tuple[Tensor, Tensor]:
@@ -54,14 +50,14 @@ def assert_same_bits(first, second) -> None:
         {"tolerance": 1e-3},
     ],
 )
-def test_closed_forms_agree_to_the_last_bit(name: str, options: dict, dtype: torch.dtype, both) -> None:
+def test_closed_forms_agree_to_the_last_bit(name: str, options: dict, dtype: torch.dtype) -> None:
     field, (origins, directions) = CLOSED[name].to(dtype), rays(dtype)
     assert_same_bits(*both(sphere_trace, field, origins, directions, **options))
     assert_same_bits(*both(sphere_trace, field, origins * 0.1, directions, **options))
 
 
 @pytest.mark.parametrize("off", [0.0, 0.02, -0.02, 0.4])
-def test_expectations_right_and_wrong(off: float, both) -> None:
+def test_expectations_right_and_wrong(off: float) -> None:
     field, (origins, directions) = CLOSED["torus"].double(), rays(torch.float64)
     hits, slope, _ = trace_expected(field, origins, directions, None)
     unknown = torch.full_like(hits.depth, torch.inf)
@@ -72,7 +68,7 @@ def test_expectations_right_and_wrong(off: float, both) -> None:
 
 
 @pytest.mark.parametrize("few", [_ahead.FEW, 20], ids=["room", "little-room"])
-def test_levels_agree_within_the_tolerance(few: int, both, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_levels_agree_within_the_tolerance(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Matrix products with other rows beside them round differently; each depth is exact to the tolerance."""
     for name, number in {"FEW": few, "SHARE": 0.01, "LEAST_ROOM": 5, "SPARE": 0.6}.items():
         monkeypatch.setattr(_ahead, name, number)
@@ -86,7 +82,7 @@ def test_levels_agree_within_the_tolerance(few: int, both, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("few", [_ahead.FEW, 5], ids=["room", "little-room"])
 @pytest.mark.parametrize("name", ["union", "placed", "difference-of-multiscale", "slice"])
-def test_fields_of_fields(name: str, few: int, both, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fields_of_fields(name: str, few: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_ahead, "FEW", few)
     monkeypatch.setattr(_ahead, "LEAST_ROOM", few)
     field: Field = FIELDS[name]().double()
@@ -109,7 +105,7 @@ class Own(Watched):
         return super().value(x, level=level)
 
 
-def test_a_users_field_chooses_its_path(both) -> None:
+def test_a_users_field_chooses_its_path() -> None:
     origins, directions = rays(torch.float64)
     for same in (True, False):
         field = Own(three_levels().double(), same_rows=same)
@@ -121,7 +117,7 @@ def test_a_users_field_chooses_its_path(both) -> None:
         assert FIELDS[name]().same_rows == same
 
 
-def test_no_rays(both) -> None:
+def test_no_rays() -> None:
     nothing = torch.zeros(0, 3)
     assert_same_bits(*both(sphere_trace, CLOSED["sphere"].float(), nothing, nothing))
     away = torch.tensor([[0.0, 0.0, 3.0]])

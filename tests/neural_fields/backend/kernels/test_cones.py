@@ -21,7 +21,7 @@ def counted(watch: Callable[..., list[int]]) -> list[int]:
 
 
 def picture(place: torch.device, size: int = 16) -> tuple[Tensor, Tensor]:
-    """A pinhole's rays, of which those at the edge miss the ball of the surface."""
+    """Rays of a pinhole; those at the edge miss the ball."""
     across = torch.linspace(-0.6, 0.6, size)
     rows, columns = torch.meshgrid(across, across, indexing="ij")
     directions = normalize(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1), dim=-1)

@@ -136,7 +136,7 @@ def test_rays_through_bands_end_where_pytorchs_do(taper: float, place: torch.dev
 
 
 def test_more_rays_than_a_tile_go_round_their_rings(place, counted, monkeypatch) -> None:
-    """One program, whose rings are longer than a tile and no multiple of it; nobody gets far in three steps."""
+    """One program, whose rings are longer than a tile and no multiple of it; three steps take no ray far."""
     monkeypatch.setattr(launch, "INTERPRETED_PROGRAMS", 1)
     field, (origins, directions) = waves(place), rays(90, place)
     ours, theirs = both(field, origins, directions, max_steps=3, **COARSE)
