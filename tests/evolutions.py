@@ -62,11 +62,11 @@ def ball(path: Path, radius: float, *, levels: bool = False) -> None:
 
 
 def interrupt(stage: str, step: int) -> Callable[[Progress], None]:
-    """A progress display that presses Ctrl-C, once, at a step of a stage."""
+    """A progress display that presses Ctrl-C, once, from a step of a stage on."""
     done = []
 
     def report(progress: Progress) -> None:
-        if progress.stage == stage and progress.step == step and not done:
+        if progress.stage == stage and progress.step >= step and not done:
             done.append(step)
             os.kill(os.getpid(), signal.SIGINT)
 

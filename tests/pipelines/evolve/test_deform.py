@@ -94,7 +94,7 @@ def test_a_run_keeps_its_motion_and_resumes_to_the_same_bits(tmp_path, monkeypat
     run = evolve(few, out=whole)
     assert len(run.record["motion"]) == 1
     with pytest.raises(Interrupted):
-        evolve(few, out=broken, progress=interrupt("level 0", 1))
+        evolve(few, out=broken, progress=interrupt("level 0", 0))
     with monkeypatch.context() as patch:
         patch.setattr(deform, "match", lambda *_: pytest.fail("the motion is learnt already"))
         evolve(few, out=broken, resume=True)
