@@ -1,5 +1,3 @@
-"""Shapes that several benchmarks measure."""
-
 from pathlib import Path
 
 import pytest

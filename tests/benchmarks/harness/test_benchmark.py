@@ -12,7 +12,7 @@ from mplicits.neural_fields import InputError
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Progress
 
-from benchmarks.harness.benchmark import Benchmark, Part, from_figures, one_of_each, write_results
+from benchmarks.harness.benchmark import Benchmark, Part, from_figures, write_results
 from benchmarks.harness.cells import Catalogue
 from benchmarks.harness.report import as_text
 from benchmarks.harness.run import run_cell, run_cells
@@ -120,9 +120,3 @@ def test_results_of_what_is_done(tmp_path: Path) -> None:
     heads = ["Squares", "square  area", "------  ----"]
     assert as_text(table).splitlines() == [*heads, "edge 2   4.0", "edge 1   1.0", "A note."]
     assert write_results(planned[1:], tmp_path, command="x")[0] == []
-
-
-def test_two_of_one_name() -> None:
-    one_of_each(["a", "b"], "meshes")
-    with pytest.raises(InputError, match="b: two of the meshes"):
-        one_of_each(["a", "b", "b"], "meshes")

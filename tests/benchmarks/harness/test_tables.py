@@ -1,5 +1,3 @@
-"""Tables from made-up records, in every format; plots."""
-
 import csv
 import io
 import json

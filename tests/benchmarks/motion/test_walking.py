@@ -22,8 +22,8 @@ def test_there_and_back():
 
 
 def test_derivatives_are_those_of_the_map():
-    # At 0 and 1/2 the curvature that is held away from 0 has a jump; it changes by 2π · 2 · 0.6 / 0.16 < 50 a unit of
-    # time. Between the legs ∂κ/∂y is 1.5 · 0.5 / (0.04 · 0.16) < 120, and the series miss 2e-12 of it.
+    # The curvature, held away from 0, jumps at 0 and 1/2; it changes by 2π · 2 · 0.6 / 0.16 < 50 in a unit of time.
+    # Between the legs ∂κ/∂y is 1.5 · 0.5 / (0.04 · 0.16) < 120. The series miss 2e-12 of it.
     x, t = inside(*BODY)
     check_derivatives(MOTION, x, 0.03 + 0.44 * t, gradient_bound=1e-8)
 

@@ -17,7 +17,7 @@ from benchmarks.paper import bench, names
 
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> dict[str, Exact]:
-    """The methods of the paper by their names, of which one fails."""
+    """The methods of the paper by their names; IDF fails."""
     titles = {"ours": "Ours fine", "siren": "SIREN"}
     methods = [Exact(name, None if name == "idf" else RADIUS, title=titles.get(name, name)) for name in names.METHODS]
     monkeypatch.setattr(bench, "CATALOGUE", Catalogue(methods))
@@ -58,7 +58,7 @@ def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixtur
     assert main([*command, "--table", "comparison", "deltas"]) == 0
     assert runs(exact) == 3
 
-    # What a method that is not asked for has found stays; the page can be had elsewhere, with its pictures.
+    # Results of methods left out of the command stay; the page can be written elsewhere, with its pictures.
     elsewhere = tmp_path / "docs" / "figures.md"
     elsewhere.parent.mkdir()
     assert main([*command[:-1], "ours", "--table", "comparison", "--page", str(elsewhere)]) == 0

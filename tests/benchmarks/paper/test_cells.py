@@ -71,6 +71,8 @@ def test_damage(ball: Path, tmp_path: Path) -> None:
     np.savetxt(tmp_path / "bare.xyz", clean.points)
     with pytest.raises(InputError, match="has no normals for noise"):
         damaged_cloud(dataclasses.replace(cell, shape=tmp_path / "bare.xyz"))
+    with pytest.raises(ValueError, match=r"fraction=1\.5"):
+        damaged_cloud(dataclasses.replace(cell, flipped=1.5))
 
 
 def test_a_record_is_measured_kept_and_not_made_again(ball: Path, out: Path) -> None:

@@ -1,5 +1,3 @@
-"""The normal mapping benchmark on fields whose surfaces are known."""
-
 import dataclasses
 import json
 import math

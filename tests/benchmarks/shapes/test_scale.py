@@ -1,5 +1,3 @@
-"""The benchmark of cloud sizes."""
-
 from pathlib import Path
 
 import numpy as np

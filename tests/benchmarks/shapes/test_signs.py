@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mplicits.datasets import OrientedCloud, PointCloud
+from mplicits.datasets.clouds.point_cloud import unit_rows
 from mplicits.pipelines.fit.train import prepare
 from mplicits.pipelines.fit.unoriented import SIGNING
 from mplicits.pipelines.training.settings import FitConfig
@@ -48,8 +49,7 @@ def test_normals_that_point_inward_are_counted(ball: Path, tmp_path: Path, monke
 
 def test_points_that_smoothing_drops_do_not_mix_up_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every point has another normal here, so that one that is taken for its neighbour shows."""
-    points = np.random.default_rng(0).normal(size=(500, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points = unit_rows(np.random.default_rng(0).normal(size=(500, 3)))
     clean = PointCloud(points, points.astype(np.float32), None, "ball")
     still = prepare(clean, CONFIG)
     left = np.arange(500) % 50 > 0

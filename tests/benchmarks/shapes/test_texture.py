@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 from evolutions import fails
-from mplicits.datasets import Camera, TexturedMesh, look_at, srgb_to_linear
+from mplicits.datasets import TexturedMesh, look_at, srgb_to_linear
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.trace import Seen
 from mplicits.pipelines.training.settings import FitConfig, TextureConfig
@@ -22,29 +22,21 @@ from benchmarks.shapes import texture as bench_texture_fits
 from benchmarks.shapes.compare import Drawing, draw, image_error, psnr
 from benchmarks.shapes.texture import PAPER_MSE, TextureBench, TextureRow
 
-CORNERS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
-FILLING = 2 * math.degrees(math.atan(1 / 3))  # the angle at which the square just fills an image from 3 away
-
-
-def square(image: np.ndarray) -> TexturedMesh:
-    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])[TRIANGLES]
-    return TexturedMesh(CORNERS, TRIANGLES, uv, image.astype(np.float32))
-
-
-def front(pixels: int, z: float = 3.0) -> Camera:
-    return look_at((0.0, 0.0, z), (0.0, 0.0, 0.0), fov=FILLING, width=pixels, height=pixels)
-
 
 def test_a_square_seen_from_the_front_is_its_image():
     image = np.random.default_rng(0).random((8, 8, 3))
-    seen = mesh_view(square(image), front(8))
+    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    square = TexturedMesh(corners, triangles, (corners[triangles][..., :2] + 1) / 2, image.astype(np.float32))
+    fov = 2 * math.degrees(math.atan(1 / 3))  # the square just fills the picture
+    camera = look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), fov=fov, width=8, height=8)
+    seen = mesh_view(square, camera)
     assert seen.pixel.tolist() == list(range(64))
     np.testing.assert_allclose(seen.color.numpy().reshape(8, 8, 3), image, atol=1e-6)
     np.testing.assert_allclose(seen.normal.numpy(), np.tile([0.0, 0.0, 1.0], (64, 1)), atol=1e-6)
-    _, directions = front(8).rays()
-    torch.testing.assert_close(seen.direction, directions.reshape(-1, 3))
-    torch.testing.assert_close(seen.depth, -3 / directions.reshape(-1, 3)[:, 2])
+    directions = camera.rays()[1].reshape(-1, 3)
+    torch.testing.assert_close(seen.direction, directions)
+    torch.testing.assert_close(seen.depth, -3 / directions[:, 2])
 
 
 def seen_at(pixels: list[int], size: tuple[int, int]) -> Seen:

@@ -1,5 +1,3 @@
-"""Clouds whose density varies: how many points, how much it varies, and where they lie."""
-
 import numpy as np
 import pytest
 from mplicits.neural_fields import Box, extract_mesh

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from mplicits.datasets import PointCloud, read_cloud, write_cloud_ply
 from mplicits.datasets.clouds.large import Merging, merge_cloud
+from mplicits.datasets.clouds.point_cloud import unit_rows
 from mplicits.datasets.clouds.readers.columns import MemoryStream
 from mplicits.datasets.clouds.readers.reading import open_stream
 from mplicits.neural_fields import InputError
@@ -93,8 +94,7 @@ def test_not_finite_repeated_and_isolated_points() -> None:
 def test_in_pieces_as_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where voxels turn out too small under way: doubling them later is doubling them before."""
     random = np.random.default_rng(0)
-    normals = random.normal(size=(30_000, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit_rows(random.normal(size=(30_000, 3)))
     cloud = PointCloud(normals * 0.5 + 1e6, normals.astype(np.float32), random.random((30_000, 3)).astype(np.float32))
     whole, report = merged(cloud, limit=3000, voxel=0.004)
     monkeypatch.setattr(large_cloud, "MERGE", large_cloud.MergeOptions(rows=1000))

@@ -121,12 +121,8 @@ def test_noise_is_measured_and_smoothed_away_but_not_over_the_edge():
     assert off.mean() < 0.4 * 0.002 * 2
     assert np.median(degrees_between(raw.normals, -normal[None])) > 20
     assert np.median(degrees_between(cloud.normals[left], -normal[None])) < 6
-    assert np.abs(cloud.points[:, 2] - lens_depth(cloud.points, depth, lens)).max() < 0.05
-
-
-def lens_depth(points, depth, lens):
-    u, v = np.rint(lens.project(points)[0]).astype(int).T
-    return depth[v, u]
+    u, v = np.rint(lens.project(cloud.points)[0]).astype(int).T
+    assert np.abs(cloud.points[:, 2] - depth[v, u]).max() < 0.05
 
 
 def test_plateaus_of_quantised_depth_are_smoothed_over():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets.cameras import Camera, look_at
+from mplicits.datasets.clouds.point_cloud import unit_rows
 from mplicits.datasets.synthetic import scenes
 from mplicits.datasets.synthetic.scenes import LAMP, SCENES, Scene, render_scene, render_view
 from mplicits.neural_fields import Box, Similarity
@@ -102,9 +103,7 @@ def test_gloss_is_the_mirror_image_of_the_lamp(sphere):
         hit, points = sphere_hits(camera)
         assert not more[~hit].any()
         normals = points / 0.6
-        back = np.array(eye) - points
-        halfway = lamp + back / np.linalg.norm(back, axis=2, keepdims=True)
-        halfway /= np.linalg.norm(halfway, axis=2, keepdims=True)
+        halfway = unit_rows(lamp + unit_rows((np.array(eye) - points).reshape(-1, 3))).reshape(points.shape)
         lit = hit & (normals @ lamp > 0)
         wanted = np.where(lit, scenes.GLOSS * (normals * halfway).sum(axis=2).clip(0) ** scenes.SHARPNESS, 0)
         clipped = srgb_to_linear(plain)[..., 0] + wanted > 1
@@ -115,7 +114,7 @@ def test_gloss_is_the_mirror_image_of_the_lamp(sphere):
 
 
 def test_a_box_covers_a_square_with_even_edges():
-    """Its near face alone is seen: f·2a/(d − a) pixels wide, of which the outermost ones are covered by shares."""
+    """Its near face alone is seen: f·2a/(d − a) pixels wide."""
     scene = Scene("box", Box(half_size=(0.3, 0.3, 0.3)), lambda points: np.ones_like(points), radius=0.55)
     for size in (20, 15, 25):  # focal lengths of twice as many pixels
         camera = look_at((0, 0, 2.3), (0, 0, 0), fov=2 * math.degrees(math.atan(0.25)), width=size, height=size)

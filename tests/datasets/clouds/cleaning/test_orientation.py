@@ -32,7 +32,7 @@ def test_a_closed_surface_encloses_what_is_in_it() -> None:
 
 
 def test_each_hollow_is_a_region() -> None:
-    """Regions are numbered by their size, of which ∫ is 4/3 π (0.8³ − 0.5³) here and 4/3 π 0.5³ there."""
+    """Regions are numbered by size: 4/3 π (0.8³ − 0.5³) and 4/3 π 0.5³."""
     points = np.concatenate([sample_sphere(9000, radius=radius).points for radius in (0.8, 0.5)])
     nested = Exterior(points)
     assert nested.count == 3

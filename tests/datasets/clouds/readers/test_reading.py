@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets import PointCloud, read_cloud, write_cloud_ply
+from mplicits.datasets.clouds.point_cloud import unit_rows
 from mplicits.datasets.clouds.readers.reading import open_stream
 from mplicits.neural_fields import InputError
 from refusals import refused
@@ -19,8 +20,7 @@ PLY_KINDS = [{"file_type": "ply", "encoding": encoding} for encoding in ("ascii"
 @pytest.fixture
 def cloud():
     random = np.random.default_rng(3)
-    normals = random.normal(size=(COUNT, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit_rows(random.normal(size=(COUNT, 3)))
     points = random.normal(size=(COUNT, 3)) + np.array((431234.5678, 5412345.6789, 250.0))
     return PointCloud(points, normals, random.integers(0, 256, (COUNT, 3)) / np.float32(255), "made up")
 

@@ -1,22 +1,18 @@
-"""Tables in the dialects of other programs: one row here for each, and what is read of it.
-
-The same cloud is written each time: points far from the origin, unit normals, and colours of 8 bits.
-"""
+"""Tables in the dialects of other programs: the same points, normals and colours of 8 bits, far from the origin."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mplicits.datasets import read_cloud
-from mplicits.datasets.clouds.point_cloud import colors_from
+from mplicits.datasets.clouds.point_cloud import colors_from, unit_rows
 from mplicits.datasets.clouds.readers.reading import open_stream
 from mplicits.neural_fields import InputError
 from refusals import refused
 
 COUNT = 40
 RANDOM = np.random.default_rng(0)
-N = RANDOM.normal(size=(COUNT, 3))
-N /= np.linalg.norm(N, axis=1, keepdims=True)
+N = unit_rows(RANDOM.normal(size=(COUNT, 3)))
 P = (2 * N + [431234.5, 5412345.6, 250.0]).round(6)
 C = RANDOM.integers(0, 256, (COUNT, 3))
 I = RANDOM.integers(-2048, 2048, (COUNT, 1))  # noqa: E741 (intensity)
@@ -165,7 +161,7 @@ def test_ply(tmp_path, names, encoding, shades):
 
 
 def lzf(data):
-    """Pack by LZF: repeats of 3 to 8 bytes are looked for at each place, the rest stands as it is."""
+    """Pack by LZF: repeats of 3 to 8 bytes are looked for at each place; the rest is not packed."""
     out, plain, at = bytearray(), bytearray(), 0
     while at <= len(data):
         start, length = data.rfind(data[at : at + 3], max(0, at - 8000), at + 2) if at + 3 <= len(data) else -1, 3

@@ -1,5 +1,3 @@
-"""COLMAP's progress, as its database tells it."""
-
 import sqlite3
 from contextlib import closing
 from itertools import combinations
