@@ -13,17 +13,14 @@ from .fields.similarity import Similarity
 from .hosts.adapters import InstantNSRGeometry, NerfstudioField, NeuSGeometry
 from .meshing.extract import NoSurfaceError, extract_mesh
 from .meshing.mesh import Mesh
-from .networks.multiscale import MultiscaleSDF
-from .networks.radiance import ViewColor
+from .networks.colors import TextureField, ViewColor
+from .networks.multiscale import MultiscaleSDF, fit_sphere
 from .networks.siren import Siren
-from .networks.sphere_init import fit_sphere
-from .networks.texture import TextureField
 from .shape import WorldField
 from .spacetime.field import SpaceTimeSDF, TimeSlice, at_time
 from .spacetime.flow import flow
 from .spacetime.moving import Moving, RigidMotion
-from .tracing.projection import map_colors, project_to_surface
-from .tracing.sphere import sphere_trace
+from .tracing.sphere import map_colors, project_to_surface, sphere_trace
 from .volume.render import render_volume
 
 __all__ = [
@@ -78,12 +75,10 @@ _MOVED = {
     "hosts.adapters": "Deviation",
     "hosts.learning_rates": "parameter_groups share_rate=rescale_parameters",
     "meshing.extract": "map_normals",
-    "meshing.placement": "Placement",
+    "fields.similarity": "Placement",
     "networks.encoded": "EncodedField",
-    "networks.multiscale": "levels_of",
-    "networks.radiance": "Outside Radiance",
-    "networks.sphere_init": "solve_sphere",
-    "networks.texture": "ColorSiren",
+    "networks.colors": "ColorSiren Outside Radiance",
+    "networks.multiscale": "levels_of solve_sphere",
     "shape": "Closest WorldHits in_one_frame",
     "spacetime.evolution": "Law curvature key_loss law_loss mean_curvature morph near_surface normal_speed transport",
     "spacetime.field": "SpaceTimeJet spacetime_jet",
@@ -91,8 +86,7 @@ _MOVED = {
     "spacetime.moving": "Keyframes ShrinkingSphere",
     "spacetime.velocity": "CarriedKeyframes Velocity VelocityJet VelocitySiren",
     "tracing.cones": "cone_starts",
-    "tracing.projection": "Mapped map_attribute",
-    "tracing.sphere": "Hits",
+    "tracing.sphere": "Hits Mapped map_attribute",
     "volume.render": "Rendered Sampling",
 }
 

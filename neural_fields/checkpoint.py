@@ -23,13 +23,12 @@ from .fields.csg import Bounded, Combined, Difference, Intersection, Offset, Pla
 from .fields.field import Field, plain
 from .fields.primitives import Box, Capsule, Plane, Sphere, Torus
 from .fields.similarity import Similarity
+from .networks.colors import ColorSiren, Outside, Radiance, TextureField, ViewColor
 from .networks.encoded import EncodedField
-from .networks.hash_encoding import HashEncoding, grid_resolutions
+from .networks.grids import HashEncoding, grid_resolutions
 from .networks.multiscale import MultiscaleSDF
 from .networks.neus_mlp import NeusSDF
-from .networks.radiance import Outside, Radiance, ViewColor
 from .networks.siren import Siren
-from .networks.texture import ColorSiren, TextureField
 from .spacetime.field import SpaceTimeSDF
 
 M = TypeVar("M", bound=nn.Module)

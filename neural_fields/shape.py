@@ -17,8 +17,7 @@ from .fields.field import Field, FieldLike, solid
 from .fields.similarity import Similarity
 from .meshing._cells import Bounds
 from .meshing.extract import DEFAULT_BOUNDS, Mesh, extract_mesh
-from .tracing.projection import project_to_surface
-from .tracing.sphere import sphere_trace
+from .tracing.sphere import project_to_surface, sphere_trace
 from .upward import upward
 
 Points = TypeVar("Points", NDArray[np.floating], Tensor)

@@ -28,7 +28,7 @@ from mplicits.neural_fields import (
 from mplicits.neural_fields.fields.csg import Bounded, Placed
 from mplicits.neural_fields.fields.field import SecondJet
 from mplicits.neural_fields.networks.encoded import EncodedField
-from mplicits.neural_fields.networks.hash_encoding import HashEncoding
+from mplicits.neural_fields.networks.grids import HashEncoding
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Siren, TextureField, sphere_trace
-from mplicits.neural_fields.networks.sphere_init import solve_sphere
-from mplicits.neural_fields.networks.texture import ColorSiren
+from mplicits.neural_fields.networks.colors import ColorSiren
+from mplicits.neural_fields.networks.multiscale import solve_sphere
 
 PATIENCE = 60.0
 TITLE = "<img src=x onerror=alert(1)> & ball"

@@ -4,7 +4,7 @@ import inspect
 from functools import partial
 
 import pytest
-from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct import train as reconstruct_texture

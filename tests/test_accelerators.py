@@ -36,8 +36,8 @@ from mplicits.neural_fields import (
     render_volume,
     sphere_trace,
 )
-from mplicits.neural_fields.networks.radiance import ViewColor
-from mplicits.neural_fields.networks.sphere_init import fit_sphere, solve_sphere
+from mplicits.neural_fields.networks.colors import ViewColor
+from mplicits.neural_fields.networks.multiscale import fit_sphere, solve_sphere
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
 from mplicits.neural_fields.tracing.cones import cone_ends, cone_starts
 from mplicits.neural_fields.volume.render import Sampling

@@ -21,7 +21,7 @@ import pytest
 import torch
 from mplicits import neural_fields
 from mplicits.neural_fields import upward
-from mplicits.pipelines.training.machine import environment
+from mplicits.neural_fields.backend.devices import environment
 
 ROOT = Path(__file__).parent.parent
 # From the ground up. A room imports from those above it in this list, never from those below.

@@ -42,7 +42,7 @@ def _kernels_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _kernels(arguments: argparse.Namespace) -> int:
-    from mplicits.pipelines.training.machine import choose_device
+    from mplicits.neural_fields.backend.devices import choose_device
 
     device = str(choose_device("auto"))
     if device == "cpu":  # before anything imports Triton
@@ -109,7 +109,7 @@ def _render_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _render(arguments: argparse.Namespace) -> int:
     config = read_settings(arguments, FitConfig)
-    from mplicits.pipelines.training.machine import choose_device
+    from mplicits.neural_fields.backend.devices import choose_device
 
     from ..costs.render import RenderBench
 

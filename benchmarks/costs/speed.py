@@ -20,11 +20,17 @@ from typing import Any
 import numpy as np
 import torch
 from mplicits.neural_fields import Field, InputError, Jet, MultiscaleSDF, Siren, load_field
-from mplicits.neural_fields.backend.devices import one_thread, over_blocks, split_operations
+from mplicits.neural_fields.backend.devices import (
+    best_seconds,
+    one_thread,
+    over_blocks,
+    peak_memory,
+    sgemm_rate,
+    split_operations,
+)
 from mplicits.neural_fields.meshing.extract import DEFAULT_BOUNDS, extract_mesh
 from mplicits.neural_fields.networks.multiscale import levels_of
 from mplicits.pipelines.training.folder import find_field
-from mplicits.pipelines.training.machine import best_seconds, peak_memory, sgemm_rate
 from mplicits.pipelines.training.trainer import seeded
 from numpy.typing import NDArray
 from scipy.spatial import KDTree

@@ -18,8 +18,8 @@ from typing import Any, ClassVar, Generic, TypeVar, Union, get_args, get_origin,
 
 import torch
 from mplicits.neural_fields import InputError
+from mplicits.neural_fields.backend.devices import choose_device, environment, sgemm_rate
 from mplicits.neural_fields.backend.files import write_json, write_whole
-from mplicits.pipelines.training.machine import choose_device, environment, sgemm_rate
 
 from .cells import Catalogue, Findings, Method, Record, Workplace, make_folder
 from .report import Section, as_csv, as_dict, as_page

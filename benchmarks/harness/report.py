@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from mplicits.pipelines.training.machine import format_table
+from mplicits.pipelines.training.progress import format_table
 
 from .tables import Column, Row, Table, Value
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
+from mplicits.neural_fields.backend.devices import choose_device, environment
 from mplicits.pipelines.training.jobs import Outcome, check_jobs, run_jobs, run_streams
-from mplicits.pipelines.training.machine import choose_device, environment
 from mplicits.pipelines.training.trainer import Interrupted, Report
 
 from .cells import Catalogue, Cell, Record, Workplace, read_record, write_record

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from mplicits.neural_fields import InputError
+from mplicits.neural_fields.backend.devices import choose_device, sgemm_rate
 from mplicits.neural_fields.backend.files import files_in, write_json, write_whole
 from mplicits.pipelines.surface.surface import MESH_SUFFIXES, read_reference, read_surface
-from mplicits.pipelines.training.machine import choose_device, sgemm_rate
 
 from ..harness.benchmark import machine_words
 from ..harness.cells import Record, make_folder

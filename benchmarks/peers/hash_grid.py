@@ -11,7 +11,7 @@ from itertools import pairwise
 import torch
 from mplicits.neural_fields.backend.errors import at_least, positive
 from mplicits.neural_fields.fields.field import Jet, OneLevelField
-from mplicits.neural_fields.networks.hash_encoding import INITIAL, check_table, grid_resolutions, spatial_hash
+from mplicits.neural_fields.networks.grids import INITIAL, check_table, grid_resolutions, spatial_hash
 from torch import Tensor, nn
 
 from .trilinear import Place, interpolate, interpolate_jet, locate, vertices

@@ -24,8 +24,8 @@ from typing import Any
 
 import torch
 from mplicits.neural_fields import Field, Jet
+from mplicits.neural_fields.networks.colors import Outside, ViewColor
 from mplicits.neural_fields.networks.multiscale import levels_of
-from mplicits.neural_fields.networks.radiance import Outside, ViewColor
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
 from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective, scene_trainer
 from mplicits.pipelines.training.replay import Recorder, Results, Work

@@ -21,6 +21,7 @@ import torch
 from mplicits.datasets import Camera, OrientedCloud, PointCloud, add_isotropic_noise, add_noise, orbit, read_cloud
 from mplicits.datasets.synthetic.statue import Statue
 from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Similarity, load_field
+from mplicits.neural_fields.backend.devices import peak_memory
 from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from mplicits.pipelines.fit.cloud import load_cloud
 from mplicits.pipelines.fit.train import Run, fit, prepare
@@ -37,7 +38,6 @@ from mplicits.pipelines.surface.surface import (
     sample_points,
 )
 from mplicits.pipelines.training.folder import STATE_FILE, find_field, is_fitted, read_record
-from mplicits.pipelines.training.machine import peak_memory
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Report
 

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from mplicits.datasets import Camera, turntable
 from mplicits.neural_fields import Field, InputError, Mesh, load_field
+from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh, map_normals
 from mplicits.neural_fields.networks.multiscale import levels_of
 from mplicits.pipelines.render.picture import check_picture_path, contact_sheet, write_picture
@@ -21,7 +22,6 @@ from mplicits.pipelines.render.shade import ShadeOptions, compose, shade
 from mplicits.pipelines.render.trace import Seen, trace_view
 from mplicits.pipelines.surface.surface import read_reference
 from mplicits.pipelines.training.folder import find_field
-from mplicits.pipelines.training.machine import choose_device
 from mplicits.pipelines.training.trainer import parameter_count
 from torch import Tensor
 

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from mplicits.datasets import OrientedCloud, PointCloud
 from mplicits.neural_fields import InputError
+from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import prepare
 from mplicits.pipelines.fit.unoriented import Places, fits_better, give_signs
 from mplicits.pipelines.surface.surface import read_reference
-from mplicits.pipelines.training.machine import choose_device
 from mplicits.pipelines.training.settings import FitConfig
 from numpy.typing import NDArray
 from scipy.spatial import KDTree

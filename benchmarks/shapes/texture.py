@@ -22,13 +22,13 @@ from mplicits.neural_fields import (
     load_texture,
     map_colors,
 )
+from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from mplicits.pipelines.render.picture import Image, as_bytes, contact_sheet, write_picture
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.texture.train import texture_run
 from mplicits.pipelines.training.folder import TEXTURE_FILE, digest_of, find_field, read_record
-from mplicits.pipelines.training.machine import choose_device
 from mplicits.pipelines.training.settings import FitConfig, TextureConfig
 
 from ..harness.benchmark import Benchmark, Part, network_name, one_of_each

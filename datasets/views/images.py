@@ -24,6 +24,7 @@ from .formats.shots import DepthMap, DepthSource, Shot, find_depth_maps, list_im
 from .formats.transforms import read_transforms
 from .region import region_from_cameras, region_from_masks, region_from_points
 
+OBJECT = 0.5  # a pixel of a mask with a larger share of object counts as object
 FILES = ("cameras_sphere.npz", "transforms.json", "transforms_train.json")  # looked for in a folder, in this order
 OPAQUE = 0.999  # what is left of 1 after resampling
 EXACT = 0.01  # pixels that distorting an undistorted point may miss it by

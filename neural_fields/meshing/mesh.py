@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from ..backend.errors import InputError
 from ..backend.files import check_place, whole_file
-from ..fields.similarity import Similarity
+from ..fields.similarity import Placement, Similarity
 from .color_space import srgb_to_linear
 from .glb import MATERIAL, Motion, write_glb
-from .placement import Placement
 
 Float64 = NDArray[np.float64]
 Origin = tuple[float, float, float]

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..backend.errors import positive
 from ..fields.field import FieldLike, Jet, SecondJet, Wrapper, solid
-from .hash_encoding import HashEncoding
+from .grids import HashEncoding
 
 
 class EncodedField(Wrapper):

@@ -14,7 +14,7 @@ from torch.nn.utils import parametrizations
 
 from ..backend.errors import at_least
 from ..fields.field import Jet, OneLevelField
-from .radiance import encode, encoded_size
+from .colors import encode, encoded_size
 
 BETA = 100.0  # of the softplus
 

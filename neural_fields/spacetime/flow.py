@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from ..backend.errors import at_least, positive
 from ..fields.field import Field
-from ..tracing.projection import project_to_surface
+from ..tracing.sphere import project_to_surface
 from .evolution import VectorField
 from .field import TimeSlice, at_time
 

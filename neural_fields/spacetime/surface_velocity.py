@@ -14,8 +14,7 @@ from torch import Tensor
 
 from ..backend.errors import at_least
 from ..fields.field import Field
-from ..tracing.projection import project_to_surface
-from ..tracing.sphere import BOUNDING_RADIUS, ball_points
+from ..tracing.sphere import BOUNDING_RADIUS, ball_points, project_to_surface
 from .dynamic_tracing import moment
 from .field import at_time
 

@@ -16,8 +16,8 @@ from ...datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, rea
 from ...datasets.synthetic.samples import feet_and_normals
 from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.backend.files import check_place
+from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
-from ...neural_fields.meshing.placement import Placement
 from ..fit.train import Run, fit
 from ..mesh.files import write_mesh
 from ..render.picture import Image, contact_sheet, write_picture
@@ -25,8 +25,7 @@ from ..render.rasterise import picture_of
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import trace_view
 from ..surface.surface import from_cloud
-from ..training.machine import format_table
-from ..training.progress import Progress, Report, progress_bars, reported
+from ..training.progress import Progress, Report, format_table, progress_bars, reported
 from ..training.settings import FitConfig
 from .common import tell_budget
 

@@ -18,8 +18,8 @@ from typing import Literal
 import torch
 
 from ...neural_fields import InputError
+from ...neural_fields.backend.devices import sgemm_rate
 from ...neural_fields.backend.kernels.switch import choose
-from ..training.machine import sgemm_rate
 
 PACKAGE = "mplicits"
 OWN_CV2 = "opencv-contrib-python-headless"

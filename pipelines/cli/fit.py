@@ -82,10 +82,10 @@ def _fit(arguments: argparse.Namespace) -> int:
 
 
 def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
+    from ...neural_fields.backend.devices import peak_memory
     from ..fit.depth import fit_depth, trim_suggestion
     from ..fit.train import fit
     from ..training.folder import TEXTURE_FILE, check_new_run, is_fitted, read_record
-    from ..training.machine import peak_memory
 
     directory, depth = arguments.out, _depth_input(arguments, cloud)
     # A run that was interrupted after its fit goes on there.

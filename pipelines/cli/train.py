@@ -181,7 +181,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
 
 def _tell_left_out(record: dict[str, Any]) -> None:
     """Warn, on stderr, of photographs, and parts of them, that were not trained on."""
-    from ..reconstruct.silhouettes import named
+    from ..reconstruct.hull import named
 
     odd, torn = record.get("left_out", []), record.get("mask_holes", {})
     trained = record["views"]["trained"]

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from ...datasets.cameras import Camera
 from ...neural_fields import Field, InputError, Similarity, load_field
+from ...neural_fields.backend.devices import choose_device
 from ...neural_fields.backend.files import check_place
+from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
-from ...neural_fields.meshing.placement import Placement
 from ...neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
 from ..mesh.files import write_mesh, write_moving
 from ..render.draw import Orbit, orbit_cameras, traced_part
@@ -27,7 +28,6 @@ from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.trace import PRECISION, fine_strips, pixel_size, see_hits
 from ..texture.transport import Colors, TransportedColors, borrowed_texture, pinned_texture, start_texture
 from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, load_motion, read_record
-from ..training.machine import choose_device
 from .follow import follow_mesh
 from .shapes import Placement as ShapePlacement
 

@@ -29,9 +29,9 @@ from ...datasets import (
 from ...datasets.depth.frame import PosedFrame
 from ...datasets.depth.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from ...neural_fields import InputError
+from ...neural_fields.backend.devices import choose_device
 from ...neural_fields.backend.files import files_in, partial_of
 from ..training.folder import CLOUD_FILE, kept_cloud, read_record
-from ..training.machine import choose_device
 from ..training.result import Run
 from ..training.settings import FitConfig
 from ..training.trainer import Report

@@ -15,7 +15,7 @@ from ...neural_fields import InputError
 from ...neural_fields.backend.files import write_json
 from ..training.folder import STATE_FILE, check_new_run, is_fitted, read_record
 from ..training.jobs import Outcome, check_jobs, run_jobs
-from ..training.machine import format_table
+from ..training.progress import format_table
 from ..training.settings import FitConfig, load_config
 from ..training.trainer import Progress, Report
 from .train import fit

@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
+from ...neural_fields.backend.devices import choose_device, peak_memory
 from ..surface.surface import thinned
 from ..training.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
-from ..training.machine import choose_device, peak_memory
 from ..training.progress import reported, silent
 from ..training.result import Run
 from ..training.scaffold import BUDGET, Budget, Training, affordable, least_share

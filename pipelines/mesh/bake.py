@@ -12,8 +12,8 @@ from scipy.ndimage import distance_transform_edt
 
 from ...datasets.clouds.point_cloud import unit_rows
 from ...neural_fields import InputError, Similarity
+from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing.extract import Mesh
-from ...neural_fields.meshing.placement import Placement
 from ..surface.raster import cover
 from .atlas import decimate, to_frame, unwrap
 from .files import check_textured_path, write_textured

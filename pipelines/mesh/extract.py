@@ -19,7 +19,7 @@ from ...datasets.clouds.readers.meshes import vertex_normals
 from ...neural_fields import Field, InputError, Mesh, Similarity
 from ...neural_fields.backend.devices import upload
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh, map_normals
-from ...neural_fields.tracing.projection import map_attribute
+from ...neural_fields.tracing.sphere import map_attribute
 from ..surface.surface import Support, in_region, keep_largest, read_support, seen_part, trim_distance, without_blobs
 from ..texture.transport import Colors, colors_of_run
 from ..training.folder import TEXTURE_FILE, chosen_level, find_field, fitted_cloud, load_still

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError, Mesh, Similarity
 from ...neural_fields.backend.files import whole_file
+from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing.glb import MATERIAL, Motion
 from ...neural_fields.meshing.mesh import (
     check_mesh_path,
@@ -22,7 +23,6 @@ from ...neural_fields.meshing.mesh import (
     write_obj,
     write_triangles,
 )
-from ...neural_fields.meshing.placement import Placement
 from .atlas import check_tools
 
 Image = NDArray[np.uint8]

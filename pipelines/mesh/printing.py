@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Field, Mesh, Similarity, project_to_surface
-from ...neural_fields.meshing.placement import FRAMES, Placement
+from ...neural_fields.fields.similarity import FRAMES, Placement
 from ..surface.surface import components, sample_points
 
 Float64 = NDArray[np.float64]

@@ -27,8 +27,8 @@ from ...neural_fields import (
     save_field,
 )
 from ...neural_fields.fields.csg import Bounded
+from ...neural_fields.fields.similarity import METRES
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
-from ...neural_fields.meshing.placement import METRES
 from ...neural_fields.shape import in_one_frame
 from ..surface.distance import MeshField
 from ..surface.surface import Support, is_closed, read_support, read_surface, volume, without_blobs

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from ...neural_fields import MultiscaleSDF, NerfstudioField, Siren, ViewColor, fit_sphere
 from ...neural_fields.hosts.learning_rates import HOST_RATE
-from ...neural_fields.networks.hash_encoding import HashEncoding, tables_apart
+from ...neural_fields.networks.grids import HashEncoding, tables_apart
 from ..training.settings import ReconstructConfig
 from .schedule import WarmCosine
 

@@ -26,8 +26,8 @@ from ...neural_fields import InputError, Similarity
 from ..mesh.files import write_mesh
 from ..training.progress import Progress, Report, silent
 from .frustums import camera_mesh
+from .hull import Agreement, named
 from .measured import UNITS, said_outside
-from .silhouettes import Agreement, named
 
 Float64 = NDArray[np.float64]
 

@@ -14,12 +14,11 @@ from torch import Tensor
 
 from ...datasets.cameras import Camera
 from ...datasets.views.formats.shots import DepthMap
-from ...datasets.views.images import PosedImage, PosedImages
+from ...datasets.views.images import OBJECT, PosedImage, PosedImages
 from ...neural_fields import Field, InputError, sphere_trace
 from ...neural_fields.backend.devices import handed, uniform
 from ...neural_fields.fields.field import FieldLike
 from ...neural_fields.volume.weights import sphere_span
-from .silhouettes import OBJECT
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

@@ -14,10 +14,10 @@ from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
 from ...neural_fields.backend.devices import handed, precise
-from ...neural_fields.networks.hash_encoding import HashEncoding
+from ...neural_fields.networks.colors import Outside, Radiance, ViewColor
+from ...neural_fields.networks.grids import HashEncoding
+from ...neural_fields.networks.multiscale import fit_sphere
 from ...neural_fields.networks.neus_mlp import NeusSDF
-from ...neural_fields.networks.radiance import Outside, Radiance, ViewColor
-from ...neural_fields.networks.sphere_init import fit_sphere
 from ...neural_fields.volume.render import Rendered, Sampling, render_volume
 from ...neural_fields.volume.weights import sphere_span
 from ..training.settings import ReconstructConfig

@@ -13,8 +13,7 @@ from torch import Tensor
 from ...neural_fields.backend.devices import handed, is_supplied
 from ...neural_fields.backend.fixed_shapes import FixedShapes, fixed_shapes
 from ...neural_fields.fields.losses import eikonal_loss
-from ...neural_fields.networks.hash_encoding import tables_apart
-from ...neural_fields.networks.value_grid import ValueGrid
+from ...neural_fields.networks.grids import ValueGrid, tables_apart
 from ...neural_fields.volume.render import Sampling
 from ..training.replay import CudaGraphs, Recorder, Replays
 from ..training.settings import ReconstructConfig

@@ -12,14 +12,14 @@ import torch
 
 from ...datasets.cameras import Camera
 from ...neural_fields import InputError, Similarity
+from ...neural_fields.backend.devices import choose_device
 from ...neural_fields.backend.files import damage
 from ...neural_fields.checkpoint import load_radiance
-from ...neural_fields.networks.value_grid import ValueGrid
+from ...neural_fields.networks.grids import ValueGrid
 from ...neural_fields.volume.render import Sampling
 from ..render.draw import RenderOptions, render_run
 from ..render.picture import Image
 from ..training.folder import RADIANCE_FILE, find_field, load_still
-from ..training.machine import choose_device
 from .model import SceneModel
 from .views import render_camera
 

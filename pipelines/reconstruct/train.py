@@ -18,22 +18,21 @@ from ...datasets import PointCloud
 from ...datasets.views.formats.shots import DepthSource
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import Field, InputError, Jet, NoSurfaceError, TextureField, extract_mesh
+from ...neural_fields.backend.devices import choose_device
 from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
 from ..render.picture import Image, picture_bytes, write_picture
 from ..surface.surface import in_region, sample_points, thinned
 from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
 from ..training.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
-from ..training.machine import choose_device
 from ..training.progress import Progress, Report, reported, silent
 from ..training.result import Run
 from ..training.scaffold import BUDGET, Budget, Training
 from ..training.settings import ReconstructConfig, TextureConfig
 from ..training.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
-from .hull import begin
+from .hull import Agreement, begin
 from .measured import MeasuredDepths
 from .model import RayPool, SceneModel, build_scene
 from .objective import ReplayedTrainer, scene_trainer
-from .silhouettes import Agreement
 from .views import (
     SeenFrom,
     ViewImage,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.cameras import Camera
-from ...datasets.views.images import PosedImage, resample, shrink
+from ...datasets.views.images import OBJECT, PosedImage, resample, shrink
 from ...neural_fields import Field, Mesh, Similarity, sphere_trace
 from ...neural_fields.volume.render import Sampling
 from ...neural_fields.volume.weights import sphere_span
@@ -22,7 +22,6 @@ from ..render.picture import Image, stacked
 from ..render.rasterise import mesh_view
 from ..render.studio import sees
 from .model import SceneModel, camera_rays
-from .silhouettes import OBJECT
 
 Float32 = NDArray[np.float32]
 

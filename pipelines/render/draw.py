@@ -18,13 +18,13 @@ from ...datasets.cameras import Camera, turntable
 from ...datasets.textured.mesh import TexturedMesh
 from ...datasets.views.images import read_cameras
 from ...neural_fields import Field, InputError, Similarity, WorldField
+from ...neural_fields.backend.devices import choose_device
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 from ..fit.cloud import CloudDistance
 from ..surface.surface import read_surface, sample_points
 from ..texture.transport import Colors, colors_of_run
 from ..training.folder import TEXTURE_FILE, chosen_level, find_field, fitted_cloud, is_field, load_still
-from ..training.machine import choose_device
 from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
 from .picture import Image, check_picture_path, contact_sheet, write_picture

@@ -23,7 +23,7 @@ from ...neural_fields.backend.devices import upload
 from ...neural_fields.backend.files import damage, write_whole
 from ...neural_fields.checkpoint import texture_bytes
 from ...neural_fields.fields.losses import color_loss, tangential_loss
-from ...neural_fields.networks.texture import ColorSiren
+from ...neural_fields.networks.colors import ColorSiren
 from ...neural_fields.spacetime.dynamic_tracing import moment
 from ..fit.samples import DOMAIN
 from ..training.folder import (

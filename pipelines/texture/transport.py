@@ -24,7 +24,7 @@ from ...neural_fields.spacetime.dynamic_tracing import moment
 from ...neural_fields.spacetime.evolution import VectorField
 from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
-from ...neural_fields.tracing.projection import project_to_surface
+from ...neural_fields.tracing.sphere import project_to_surface
 from ..training.folder import find_field, load_motion
 from .spread import CELL, SpreadColors
 from .train import texture_of

@@ -1,10 +1,10 @@
-"""Progress on stderr: a bar for each stage, with the elapsed time and the time left at the pace so far; or lines."""
+"""Progress on stderr: a bar for each stage, with the elapsed time and the time left at the pace so far; and tables."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,3 +214,15 @@ def _writer(directory: Path) -> Any:
         return SummaryWriter(str(directory))
     except OSError as error:
         raise input_error(f"--tensorboard {directory}: cannot be written ({error.strerror or error})") from error
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Text in aligned columns, the first to the left and the others to the right."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = []
+    for row in [header, ["-" * width for width in widths], *rows]:
+        cells = [
+            cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)

@@ -13,8 +13,8 @@ from typing import Any, Generic, TypeVar
 from torch import Tensor, nn
 
 from ...neural_fields import Field, Similarity
+from ...neural_fields.backend.devices import choose_device, environment
 from .folder import RunFolder
-from .machine import choose_device, environment
 from .progress import Report
 from .settings import TrainingSettings
 from .trainer import StopFlag, Trainer, checkpoint_of, without_prefix

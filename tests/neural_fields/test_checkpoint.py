@@ -34,9 +34,8 @@ from mplicits.neural_fields import (
 )
 from mplicits.neural_fields.checkpoint import load_radiance, save_radiance, save_texture
 from mplicits.neural_fields.fields.csg import Bounded, Placed
-from mplicits.neural_fields.networks.hash_encoding import HashEncoding
-from mplicits.neural_fields.networks.radiance import Outside, Radiance
-from mplicits.neural_fields.networks.texture import ColorSiren
+from mplicits.neural_fields.networks.colors import ColorSiren, Outside, Radiance
+from mplicits.neural_fields.networks.grids import HashEncoding
 from safetensors import safe_open
 from safetensors.torch import save_file
 

@@ -35,12 +35,11 @@ from mplicits.neural_fields import (
 )
 from mplicits.neural_fields.fields.csg import Bounded, Placed
 from mplicits.neural_fields.hosts.learning_rates import parameter_groups, rescale_parameters
+from mplicits.neural_fields.networks.colors import ColorSiren
 from mplicits.neural_fields.networks.encoded import EncodedField
-from mplicits.neural_fields.networks.hash_encoding import HashEncoding
+from mplicits.neural_fields.networks.grids import HashEncoding, ValueGrid
+from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
-from mplicits.neural_fields.networks.sphere_init import solve_sphere
-from mplicits.neural_fields.networks.texture import ColorSiren
-from mplicits.neural_fields.networks.value_grid import ValueGrid
 from mplicits.neural_fields.shape import in_one_frame
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
 from mplicits.neural_fields.spacetime.field import spacetime_jet

@@ -8,7 +8,7 @@ import pytest
 import torch
 from mplicits.datasets import prepare_cloud, sample_sphere
 from mplicits.neural_fields import Field, Plane, Sphere, Torus, extract_mesh, sphere_trace
-from mplicits.neural_fields.networks.hash_encoding import spatial_hash
+from mplicits.neural_fields.networks.grids import spatial_hash
 from mplicits.pipelines.training.trainer import Progress
 from scipy.interpolate import RegularGridInterpolator
 from torch import Tensor

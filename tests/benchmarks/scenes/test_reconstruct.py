@@ -9,8 +9,8 @@ import torch
 from evolutions import fails
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.neural_fields import Siren, Sphere, Union, extract_mesh
+from mplicits.neural_fields.networks.colors import Outside, ViewColor
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
-from mplicits.neural_fields.networks.radiance import Outside, ViewColor
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective, scene_trainer
 from mplicits.pipelines.training.replay import Again

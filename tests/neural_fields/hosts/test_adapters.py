@@ -8,7 +8,7 @@ from bounds import assert_within, rounding
 from fields import small_multiscale
 from hosts import Heads, NeuSHost, OldHeads, Separate, points, ray_samples, rays
 from mplicits.neural_fields import InstantNSRGeometry, MultiscaleSDF, NerfstudioField, NeuSGeometry, Siren, Sphere
-from mplicits.neural_fields.networks.radiance import ViewColor
+from mplicits.neural_fields.networks.colors import ViewColor
 from mplicits.neural_fields.volume.weights import transmittance_weights
 from torch import Tensor, nn
 from torch.nn.functional import normalize, relu

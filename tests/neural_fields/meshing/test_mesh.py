@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from mplicits.datasets import read_cloud
 from mplicits.neural_fields import Box, InputError, Similarity, WorldField, extract_mesh
-from mplicits.neural_fields.meshing.placement import FRAMES, METRES, Placement
+from mplicits.neural_fields.fields.similarity import FRAMES, METRES, Placement
 from mplicits.pipelines.cli.mesh import MESH_FILES, UNITS
 from mplicits.pipelines.surface.surface import read_surface
 

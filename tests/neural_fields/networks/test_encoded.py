@@ -7,7 +7,7 @@ import torch
 from fields import small_encoded, small_multiscale
 from mplicits.neural_fields import NeuSGeometry, Plane, Siren, load_field, save_field
 from mplicits.neural_fields.networks.encoded import EncodedField
-from mplicits.neural_fields.networks.hash_encoding import HashEncoding
+from mplicits.neural_fields.networks.grids import HashEncoding
 
 
 def points(count: int = 200) -> torch.Tensor:

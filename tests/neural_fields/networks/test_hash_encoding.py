@@ -1,7 +1,7 @@
 """The hash encoding: the published grid and hash, functions that it must reproduce, and both its derivatives."""
 
 import torch
-from mplicits.neural_fields.networks.hash_encoding import HashEncoding, grid_resolutions, spatial_hash, tables_apart
+from mplicits.neural_fields.networks.grids import HashEncoding, grid_resolutions, spatial_hash, tables_apart
 
 
 def small(**options: int) -> HashEncoding:

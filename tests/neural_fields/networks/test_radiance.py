@@ -2,8 +2,8 @@
 
 import torch
 from mplicits.neural_fields import Sphere, ViewColor
-from mplicits.neural_fields.networks.hash_encoding import HashEncoding
-from mplicits.neural_fields.networks.radiance import Outside, encode, encoded_size
+from mplicits.neural_fields.networks.colors import Outside, encode, encoded_size
+from mplicits.neural_fields.networks.grids import HashEncoding
 
 
 def test_encoding_is_octaves_of_sines_and_cosines() -> None:

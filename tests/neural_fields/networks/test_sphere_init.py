@@ -3,7 +3,7 @@
 import pytest
 import torch
 from mplicits.neural_fields import Siren
-from mplicits.neural_fields.networks.sphere_init import fit_sphere, solve_sphere
+from mplicits.neural_fields.networks.multiscale import fit_sphere, solve_sphere
 
 
 def ball(count: int = 4000) -> torch.Tensor:

@@ -14,7 +14,7 @@ from mplicits.neural_fields import (
     Torus,
 )
 from mplicits.neural_fields.fields.losses import color_loss, tangential_loss
-from mplicits.neural_fields.networks.texture import ColorSiren
+from mplicits.neural_fields.networks.colors import ColorSiren
 from torch import Tensor
 
 

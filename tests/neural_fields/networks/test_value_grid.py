@@ -3,7 +3,7 @@
 import torch
 from mplicits.neural_fields import Sphere
 from mplicits.neural_fields.fields.field import as_field
-from mplicits.neural_fields.networks.value_grid import ValueGrid
+from mplicits.neural_fields.networks.grids import ValueGrid
 from torch import Tensor
 
 

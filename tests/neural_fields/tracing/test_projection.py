@@ -7,8 +7,8 @@ import torch
 from bounds import rounding
 from mplicits.neural_fields import Jet, Siren, Sphere, TextureField, Torus, map_colors, project_to_surface
 from mplicits.neural_fields.fields.field import OneLevelField
-from mplicits.neural_fields.networks.texture import ColorSiren
-from mplicits.neural_fields.tracing.projection import map_attribute
+from mplicits.neural_fields.networks.colors import ColorSiren
+from mplicits.neural_fields.tracing.sphere import map_attribute
 from torch import Tensor
 
 MAJOR, MINOR = 0.5, 0.2

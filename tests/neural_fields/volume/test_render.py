@@ -8,8 +8,8 @@ from fields import FIELDS
 from mplicits.neural_fields import Jet, MultiscaleSDF, Plane, Siren, Sphere, ViewColor, render_volume
 from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
 from mplicits.neural_fields.fields.field import OneLevelField, as_field
-from mplicits.neural_fields.networks.radiance import Outside
-from mplicits.neural_fields.networks.value_grid import ValueGrid
+from mplicits.neural_fields.networks.colors import Outside
+from mplicits.neural_fields.networks.grids import ValueGrid
 from mplicits.neural_fields.volume.render import (
     Rendered,
     Samples,

@@ -7,7 +7,7 @@ import torch
 from mplicits.datasets import look_at, read_textured, sample_textured
 from mplicits.neural_fields import MultiscaleSDF, Siren, TextureField, load_field, map_colors, save_field
 from mplicits.neural_fields.checkpoint import save_texture
-from mplicits.neural_fields.networks.texture import ColorSiren
+from mplicits.neural_fields.networks.colors import ColorSiren
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.surface.surface import read_surface

@@ -30,10 +30,10 @@ from mplicits.neural_fields import (
     save_field,
 )
 from mplicits.neural_fields.checkpoint import save_texture
-from mplicits.neural_fields.networks.texture import ColorSiren
+from mplicits.neural_fields.networks.colors import ColorSiren
 from mplicits.neural_fields.spacetime.dynamic_tracing import moment
 from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
-from mplicits.neural_fields.tracing.projection import project_to_surface
+from mplicits.neural_fields.tracing.sphere import project_to_surface
 from mplicits.pipelines.cli.draw import ANIMATE as COMMAND
 from mplicits.pipelines.evolve.animate import (
     SequenceOptions,

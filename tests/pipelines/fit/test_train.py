@@ -12,12 +12,12 @@ import pytest
 import torch
 from mplicits.datasets import PointCloud
 from mplicits.neural_fields import Field, InputError, load_field
+from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.neural_fields.meshing.extract import extract_mesh
 from mplicits.pipelines.cli.fit import describe
 from mplicits.pipelines.fit.level import JUDGE, LEVEL, calm_omega
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.folder import read_record
-from mplicits.pipelines.training.machine import choose_device
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Interrupted, Progress
 

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from mplicits.datasets import read_textured, sample_textured
 from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Plane, Similarity, Sphere
+from mplicits.neural_fields.fields.similarity import Placement
 from mplicits.neural_fields.meshing.extract import extract_mesh
-from mplicits.neural_fields.meshing.placement import Placement
 from mplicits.pipelines.mesh import atlas as unwrap_module
 from mplicits.pipelines.mesh.atlas import decimate, from_frame, to_frame, unwrap, vertex_tangents
 from mplicits.pipelines.mesh.bake import bake, check_texture_size, textured_mesh

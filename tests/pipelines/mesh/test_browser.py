@@ -16,8 +16,8 @@ import pytest
 import trimesh
 from browser import CHROMEDRIVER, CHROMIUM, FLAGS
 from mplicits.neural_fields import Capsule, Similarity, Sphere, Union, extract_mesh
+from mplicits.neural_fields.fields.similarity import Placement
 from mplicits.neural_fields.meshing.extract import Mesh
-from mplicits.neural_fields.meshing.placement import Placement
 from mplicits.pipelines.mesh.bake import textured_mesh
 from mplicits.pipelines.mesh.files import write_mesh
 from npm import THREE, fetch

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from mplicits.neural_fields import Box, FunctionField, Mesh, Similarity, Sphere, Torus, Union, extract_mesh
-from mplicits.neural_fields.meshing.placement import Placement
+from mplicits.neural_fields.fields.similarity import Placement
 from mplicits.pipelines.mesh.printing import format_report, print_report, thickness
 
 # Points are moved to the surface until |f| < 1e-5; then float32, and bisection to a 2^16th of a step.

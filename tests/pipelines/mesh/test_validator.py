@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mplicits.neural_fields import Similarity, Sphere, extract_mesh
-from mplicits.neural_fields.meshing.placement import Placement
+from mplicits.neural_fields.fields.similarity import Placement
 from mplicits.pipelines.mesh.bake import textured_mesh
 from mplicits.pipelines.mesh.files import write_mesh, write_moving
 from npm import VALIDATOR, fetch

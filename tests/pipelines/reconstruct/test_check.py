@@ -21,7 +21,7 @@ from mplicits.pipelines.cli import main
 from mplicits.pipelines.cli.views import SCENE_NAMES
 from mplicits.pipelines.reconstruct.check import DepthCheck, check_cameras, check_depths, check_files
 from mplicits.pipelines.reconstruct.frustums import camera_mesh, frustum_size
-from mplicits.pipelines.reconstruct.silhouettes import Agreement
+from mplicits.pipelines.reconstruct.hull import Agreement
 from mplicits.pipelines.surface.surface import read_surface
 
 WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}

@@ -11,10 +11,17 @@ from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import InputError, Siren
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model
-from mplicits.pipelines.reconstruct.hull import HULL, begin, carve, fitting_resolution, seen_through, start_at_hull
+from mplicits.pipelines.reconstruct.hull import (
+    HULL,
+    Agreement,
+    begin,
+    carve,
+    fitting_resolution,
+    seen_through,
+    start_at_hull,
+)
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import build_scene
-from mplicits.pipelines.reconstruct.silhouettes import Agreement
 from mplicits.pipelines.training.settings import ReconstructConfig
 
 SMALL = ReconstructConfig(

@@ -10,7 +10,7 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren
 from mplicits.neural_fields.fields.losses import eikonal_loss
-from mplicits.neural_fields.networks.sphere_init import fit_sphere
+from mplicits.neural_fields.networks.multiscale import fit_sphere
 from mplicits.neural_fields.volume.weights import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths

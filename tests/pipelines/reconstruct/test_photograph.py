@@ -11,7 +11,7 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImages
 from mplicits.datasets.views.writing import write_transforms
 from mplicits.neural_fields import InputError, Similarity, Sphere, save_field
-from mplicits.neural_fields.networks.value_grid import ValueGrid
+from mplicits.neural_fields.networks.grids import ValueGrid
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.photograph import open_scene, photograph

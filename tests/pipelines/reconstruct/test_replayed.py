@@ -10,7 +10,7 @@ import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields.backend.devices import Supply
-from mplicits.neural_fields.networks.sphere_init import fit_sphere
+from mplicits.neural_fields.networks.multiscale import fit_sphere
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene

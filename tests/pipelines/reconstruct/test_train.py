@@ -29,7 +29,7 @@ from mplicits.neural_fields import (
 )
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.reconstruct import silhouettes
+from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct.model import SceneModel
 from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct, surface_colors
 from mplicits.pipelines.surface.measure import chamfer
@@ -330,8 +330,8 @@ def test_a_picture_that_the_others_contradict_is_not_learnt_from(
 def test_what_is_behind_holes_of_masks_is_not_learnt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    limits = silhouettes.Limits(few=4)
-    monkeypatch.setattr(silhouettes, "Limits", lambda: limits)
+    limits = hull.Limits(few=4)
+    monkeypatch.setattr(hull, "Limits", lambda: limits)
     torn = with_fault(render_scene(SCENES["painted-sphere"](), views=6, size=24, samples=1), "holes")
     write_neus(tmp_path / "torn", torn)
     assert main(f"reconstruct {tmp_path / 'torn'} -o {tmp_path / 'run'} {FLAGS} --texture-steps 0".split()) == 0

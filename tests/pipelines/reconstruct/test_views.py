@@ -14,7 +14,7 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene, render_view
 from mplicits.datasets.views.images import PosedImage
 from mplicits.datasets.views.writing import write_transforms
 from mplicits.neural_fields import Jet, Mesh, Similarity, Sphere, Union, extract_mesh, save_field
-from mplicits.neural_fields.networks.value_grid import ValueGrid
+from mplicits.neural_fields.networks.grids import ValueGrid
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.model import SceneModel

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from mplicits.pipelines.training.machine import STATUS, peak_memory
+from mplicits.neural_fields.backend.devices import STATUS, peak_memory
 
 
 def test_what_was_held_is_counted_and_stays() -> None:

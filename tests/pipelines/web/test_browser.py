@@ -11,7 +11,7 @@ import pytest
 import torch
 from mplicits.datasets.cameras import look_at, turntable
 from mplicits.neural_fields import MultiscaleSDF, Siren, extract_mesh, map_colors, save_field
-from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.web.export import BITS, WebOptions, web_run
 from mplicits.pipelines.web.payload import rounded_field
 from pages import TITLE, bumpy, differences, painted, until

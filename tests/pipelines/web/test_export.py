@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, save_field
-from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.neural_fields.spacetime.field import SpaceTimeSDF
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.export import BITS

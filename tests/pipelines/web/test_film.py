@@ -8,7 +8,7 @@ import pytest
 import torch
 from mplicits.datasets.cameras import turntable
 from mplicits.neural_fields import InputError, MultiscaleSDF, Siren, extract_mesh, save_field
-from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.neural_fields.spacetime.field import SpaceTimeSDF
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.export import WebOptions, web_run

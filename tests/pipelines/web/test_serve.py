@@ -12,7 +12,7 @@ import pytest
 import torch
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import InputError, MultiscaleSDF, Siren, save_field
-from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.web.export import pack
 from mplicits.pipelines.web.serve import PageServer
 from mplicits.pipelines.web.watch import Watcher

@@ -15,7 +15,7 @@ from mplicits.datasets.cameras import look_at
 from mplicits.datasets.landmarks import read_landmarks
 from mplicits.neural_fields import Similarity, Siren, Sphere, extract_mesh, save_field
 from mplicits.neural_fields.backend.errors import InputError
-from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.assembly import SCRIPTS, field_file
 from mplicits.pipelines.web.export import WebOptions, pack

@@ -7,7 +7,7 @@ import pytest
 import torch
 from mplicits.datasets import sample_sphere, write_cloud_ply
 from mplicits.neural_fields import Siren, load_field, save_field
-from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.web.watch import Watcher
 from pages import until

@@ -8,7 +8,7 @@ import pytest
 import torch
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.neural_fields import Field, MultiscaleSDF, Siren, Sphere
-from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.render.trace import PRECISION, Seen, pixel_size, trace_view
 
 
