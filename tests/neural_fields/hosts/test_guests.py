@@ -82,9 +82,8 @@ def test_fields_can_be_mapped_and_differentiated(index: int) -> None:
 
 
 def test_networks_with_other_weights_are_mapped_over_them() -> None:
-    """An ensemble: one field, several sets of parameters."""
     members = [Siren(8, 1).requires_grad_(False) for _ in range(3)]
-    parameters, buffers = func.stack_module_state(members)  # pyright: ignore[reportArgumentType]
+    parameters, buffers = func.stack_module_state(members)
     x = points()
 
     def call(parameters: dict[str, Tensor], buffers: dict[str, Tensor]) -> Tensor:
@@ -140,12 +139,3 @@ def test_half_precision_errs_no_more_than_its_rounding(dtype: torch.dtype) -> No
     assert found.dtype == dtype
     assert bool(((found.double() - wanted).abs() <= error[:, 0]).all())
     assert siren.jet(x).gradient.dtype == dtype
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # PyTorch's compiler of itself
-def test_compiled_fields_agree() -> None:
-    for field in fields()[:2]:
-        x = points()
-        compiled = torch.compile(field.value)
-        torch.testing.assert_close(compiled(x), field.value(x), **VMAP)
