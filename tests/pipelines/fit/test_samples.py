@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import sample_torus
+from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
 from mplicits.neural_fields import Field, MultiscaleSDF, Siren, Sphere, Torus, Union
 from mplicits.neural_fields.fields.primitives import Evaluated
 from mplicits.pipelines.fit import samples as module
@@ -18,12 +19,9 @@ CPU = torch.device("cpu")
 
 
 def sphere_points(count: int, radius: float = RADIUS) -> tuple[Tensor, Tensor]:
-    """Nearly uniform points on a sphere (a Fibonacci lattice) and their normals."""
-    i = torch.arange(count, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
-    flat = (1 - z**2).sqrt()
-    normals = torch.stack((flat * turn.cos(), flat * turn.sin(), z), 1)
-    return (radius * normals).float(), normals.float()
+    """Nearly uniform points on a sphere, and their normals."""
+    normals = torch.from_numpy(fibonacci_directions(count)).float()
+    return radius * normals, normals
 
 
 @pytest.fixture(scope="module")

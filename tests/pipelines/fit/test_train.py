@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from fits import SMALL, assert_same, interrupt
-from mplicits.datasets import PointCloud
+from mplicits.datasets import PointCloud, sample_sphere
 from mplicits.neural_fields import InputError, extract_mesh, load_field
 from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.pipelines.cli.fit import describe
@@ -18,17 +18,17 @@ from mplicits.pipelines.fit import FitConfig, Interrupted, fit
 from mplicits.pipelines.fit.level import JUDGE, LEVEL, calm_omega
 from mplicits.pipelines.training.folder import read_record
 
+CENTER = np.array([1000.0, -50.0, 5.0])
 # A budget of seconds has no room for its second level.
 LONG = FitConfig(
     widths=(32, 512), depths=(2, 4), omegas=(10.0, 15.0), steps=(1000, 1000), learning_rates=(3e-3, 1e-3), batch=2048
 )
 
 
-def sphere_cloud(count: int = 3000, *, radius: float = 7.0) -> PointCloud:
+def sphere_cloud(count: int = 3000) -> PointCloud:
     """A sphere in the user's own coordinates."""
-    normals = np.random.default_rng(0).normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return PointCloud(radius * normals + [1000.0, -50.0, 5.0], normals=normals.astype(np.float32), source="ball")
+    ball = sample_sphere(count, radius=7.0)
+    return replace(ball, points=ball.points + CENTER, source="ball")
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_sphere_comes_out_as_a_sphere(fitted: Path) -> None:
     field, similarity, metadata = load_field(fitted / "field.safetensors")
     mesh = extract_mesh(field, resolution=48)
-    radii = np.linalg.norm(similarity.to_input(mesh.vertices) - [1000.0, -50.0, 5.0], axis=1)
+    radii = np.linalg.norm(similarity.to_input(mesh.vertices) - CENTER, axis=1)
     assert abs(radii - 7.0).max() < 0.05
     errors = [stage["rms_at_points"] for stage in metadata["run"]["stages"]]
     assert errors[1] < errors[0]

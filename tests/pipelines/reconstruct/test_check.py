@@ -4,7 +4,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +11,9 @@ import torch
 import trimesh
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
-from mplicits.datasets.synthetic.scenes import SCENES, render_scene, scene_cameras, scene_depths
+from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.synthetic.view_faults import with_fault
-from mplicits.datasets.views.images import PosedImage, PosedImages
+from mplicits.datasets.views.images import PosedImage
 from mplicits.datasets.views.writing import write_colmap, write_neus, write_transforms
 from mplicits.neural_fields import Similarity
 from mplicits.pipelines.cli import main
@@ -355,13 +354,7 @@ VIEWS = 10
 
 @pytest.fixture(scope="module")
 def scene():
-    """The depths of the figure, and photographs in which it is black."""
-    figure, views = SCENES["figure"](), []
-    for index, camera in enumerate(scene_cameras(figure, views=VIEWS, size=48)):
-        depth = scene_depths(figure, camera)
-        mask = np.isfinite(depth.numbers).astype(np.float32)
-        views.append(PosedImage(f"{index:03d}.png", camera, np.zeros((48, 48, 3), np.float32), mask, depth))
-    return PosedImages(tuple(views), Similarity.identity(), "the unit sphere", None, Path("figure"))
+    return render_scene(SCENES["figure"](), VIEWS, 48, samples=1, depths=True)
 
 
 def changed(images, change):

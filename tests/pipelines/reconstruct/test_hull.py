@@ -22,19 +22,9 @@ from mplicits.pipelines.reconstruct.hull import (
 )
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import build_scene
-from mplicits.pipelines.training.settings import ReconstructConfig
-from reconstructions import painted_sphere, with_views, without
+from reconstructions import TINY_SCENE, painted_sphere, with_views, without
 
-SMALL = ReconstructConfig(
-    widths=(16, 16),
-    depths=(1, 1),
-    features=2,
-    color_width=8,
-    color_depth=1,
-    color_grid=8,
-    color_frequencies=1,
-    radius=0.3,
-)
+SMALL = replace(TINY_SCENE, features=2, color_width=8, color_frequencies=1, radius=0.3)
 RADIUS = 0.6  # of the painted sphere
 
 

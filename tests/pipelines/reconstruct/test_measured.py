@@ -148,13 +148,8 @@ def test_an_exact_field_misses_nothing_and_another_one_by_its_distance(images: P
 
 def along_z(reach: float, *, eye: float = -3.0) -> DepthRays:
     """A ray along the z axis through the middle of the sphere, and how far it gets."""
-    return DepthRays(
-        torch.tensor([[0.0, 0.0, eye]]),
-        torch.tensor([[0.0, 0.0, 1.0]]),
-        torch.tensor([reach]),
-        torch.tensor([True]),
-        torch.tensor([0]),
-    )
+    origins, directions = torch.tensor([[0.0, 0.0, eye]]), torch.tensor([[0.0, 0.0, 1.0]])
+    return DepthRays(origins, directions, torch.tensor([reach]), torch.tensor([True]), torch.tensor([0]))
 
 
 def test_the_way_of_what_ends_outside_the_region_is_free() -> None:

@@ -13,15 +13,11 @@ from mplicits.pipelines.reconstruct.model import Exposures, PoseCorrections, Ray
 from mplicits.pipelines.reconstruct.objective import SceneObjective
 from mplicits.pipelines.reconstruct.train import reconstruct
 from mplicits.pipelines.reconstruct.views import ViewImage, exposed_as, measure, render_image
-from mplicits.pipelines.training.settings import ReconstructConfig
-from reconstructions import exact_model, painted_sphere, small_reconstructions
+from reconstructions import TINY_SCENE, exact_model, painted_sphere, small_reconstructions
 from torch import Tensor, nn
 
-TINY = ReconstructConfig(
-    widths=(16, 16), depths=(1, 1), omegas=(10.0, 15.0), features=4, color_width=16, color_depth=1, color_grid=8,
-    texture_steps=0,
-    exposure="affine", cameras="refined", steps=6, rays=64, uniform=16, importance=8, march_grid=0, start="sphere",
-)  # fmt: skip
+STEPS = {"steps": 6, "rays": 64, "uniform": 16, "importance": 8, "march_grid": 0, "start": "sphere", "texture_steps": 0}
+TINY = replace(TINY_SCENE, exposure="affine", cameras="refined", **STEPS)
 GAINS = (1.3, 0.65, 1.0, 1.3 / 1.0985)
 
 

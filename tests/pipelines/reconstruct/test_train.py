@@ -1,6 +1,5 @@
 """Reconstruction from files to files: what a run holds, where it is, how it is interrupted and resumed."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -9,24 +8,26 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fits import interrupt
+from evolutions import fails
+from fits import assert_same, interrupt
 from mplicits.datasets import read_cloud
 from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, sample_scene
 from mplicits.datasets.synthetic.view_faults import with_fault
 from mplicits.datasets.views.images import PosedImage, PosedImages
 from mplicits.datasets.views.writing import write_neus, write_transforms
-from mplicits.neural_fields import InputError, Similarity, Sphere, ViewColor, extract_mesh, load_field, load_texture
+from mplicits.neural_fields import InputError, Similarity, Sphere, ViewColor, extract_mesh, load_field
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct.model import SceneModel
 from mplicits.pipelines.reconstruct.train import reconstruct, surface_colors
 from mplicits.pipelines.surface.measure import chamfer
-from mplicits.pipelines.training.folder import load_state, state_bytes
+from mplicits.pipelines.training.folder import load_state, read_record, state_bytes
 from mplicits.pipelines.training.settings import ReconstructConfig, load_config
 from mplicits.pipelines.training.trainer import Interrupted, Progress
 from reconstructions import TINY_SCENE, painted_sphere, small_reconstructions, with_views, without
+from safetensors.torch import load_file
 from torch import Tensor
 
 WORLD = Similarity(center=(120.0, -30.0, 8.0), scale=5.0)
@@ -71,39 +72,20 @@ def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def record_of(run: Path) -> dict[str, Any]:
-    return json.loads((run / "run.json").read_text())
-
-
 def contents(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in run.iterdir() if path.name != "run.lock"}
 
 
-def tensors(directory: Path) -> dict[str, Tensor]:
-    """All numbers of a run's field and texture."""
-    field, _, _ = load_field(directory / "field.safetensors")
-    texture = load_texture(directory / "texture.safetensors", field)
-    return {**field.state_dict(), **{f"texture.{name}": tensor for name, tensor in texture.state_dict().items()}}
-
-
-def assert_same(first: Path, second: Path) -> None:
-    torch.testing.assert_close(tensors(second), tensors(first), rtol=0, atol=0)
-
-
-def fails(capsys: pytest.CaptureFixture[str], line: str) -> str:
-    """Run a command that must fail as bad input does → its one line."""
-    capsys.readouterr()
-    assert main(line.split()) == 2
-    output, error = capsys.readouterr()
-    assert output == ""
-    (message,) = error.splitlines()
-    return message
+def assert_same_run(first: Path, second: Path) -> None:
+    """That the fields and textures of two runs are the same to the bit."""
+    for name in ("field.safetensors", "texture.safetensors"):
+        torch.testing.assert_close(load_file(second / name), load_file(first / name), rtol=0, atol=0)
 
 
 def test_the_run_directory(finished: Path, data: Path) -> None:
     names = {name.split(".")[0] for name in contents(finished)}
     assert names == {"field", "held_out", "radiance", "run", "support", "texture"}
-    record = record_of(finished)
+    record = read_record(finished)
     assert record["finished"] is True
     assert record["data"] == str(data / "cameras_sphere.npz")
     assert record["views"] == {"trained": 4, "held_out": 2}
@@ -129,9 +111,8 @@ def test_what_comes_back_is_what_was_written(data: Path, finished: Path) -> None
     run = reconstruct(data, TINY)
     assert run.directory is None
     assert run.texture is not None
-    expected = tensors(finished)
-    assert all(torch.equal(tensor, expected[name]) for name, tensor in run.model.geometry.state_dict().items())
-    assert run.record["held_out"]["psnr"] == record_of(finished)["held_out"]["psnr"]
+    assert_same(run.model.geometry, load_field(finished / "field.safetensors").field)
+    assert run.record["held_out"]["psnr"] == read_record(finished)["held_out"]["psnr"]
 
 
 def test_pictures_without_masks_have_an_outside() -> None:
@@ -148,16 +129,16 @@ def test_measured_depths_are_used_as_soon_as_there_are_any(tmp_path: Path, capsy
     write_neus(data, with_views(moved(painted_sphere(5, 12, depths=True), WORLD), in_world))
     command = f"reconstruct {data} -o {run} {FLAGS} --depth-maps {data / 'depths'}"
     assert main(command.split()) == 0
-    record = record_of(run)
+    record = read_record(run)
     assert record["measured_depths"] > 50
     assert record["config"]["depth_maps"] == str(data / "depths")
     assert "depth" in record["losses"]
     # In other units than the cameras they are refused before anything is trained.
     assert "--depth-scale" in fails(capsys, f"{command} --force --depth-scale 1000")
-    assert record_of(run) == record
+    assert read_record(run) == record
     assert main(f"{command} --force --depth-scale 1000 --depth-kind relative".split()) == 0
     assert main(f"{command} --force --depth-weight 0".split()) == 0
-    assert "measured_depths" not in record_of(run)
+    assert "measured_depths" not in read_record(run)
 
 
 def test_pictures_on_the_way(data: Path, tmp_path: Path) -> None:
@@ -178,21 +159,21 @@ def test_an_interrupted_run_is_usable_and_resumes_to_the_same_bits(
 ) -> None:
     with pytest.raises((Interrupted, KeyboardInterrupt)):
         reconstruct(data, TINY, out=tmp_path, progress=interrupt(stage, step))
-    assert record_of(tmp_path)["finished"] is False
+    assert read_record(tmp_path)["finished"] is False
     assert load_field(tmp_path / "field.safetensors").field.num_levels == 2
     assert len(mesh_run(tmp_path, tmp_path / "mesh.ply", MeshOptions(resolution=32)).faces) > 100
-    record, whole = reconstruct(data, out=tmp_path, resume=True).record, record_of(finished)
+    record, whole = reconstruct(data, out=tmp_path, resume=True).record, read_record(finished)
     assert (record["finished"], record["steps"]) == (True, 40)
     assert (record["losses"], record["held_out"]) == (whole["losses"], whole["held_out"])
     assert not (tmp_path / "resume.safetensors").exists()
-    assert_same(finished, tmp_path)
+    assert_same_run(finished, tmp_path)
 
 
 def test_nothing_is_lost_while_the_texture_is_trained(data: Path, tmp_path: Path) -> None:
     config = replace(TINY, steps=2, texture_steps=21)
     with pytest.raises(Interrupted, match="checkpoint"):
         reconstruct(data, config, out=tmp_path, progress=interrupt("texture", 20))
-    assert record_of(tmp_path)["finished"] is False
+    assert read_record(tmp_path)["finished"] is False
     texture = reconstruct(data, out=tmp_path, resume=True).record["texture"]
     assert (texture["finished"], texture["steps"]) == (True, 21)
 
@@ -240,7 +221,7 @@ def test_the_command_leaves_a_coloured_mesh(data: Path, tmp_path: Path, capsys: 
     # A new one leaves nothing of it.
     assert main(f"reconstruct {data} -o {run} --force {FLAGS} --texture-steps 0 --test-every 0".split()) == 0
     assert {name.split(".")[0] for name in contents(run)} == {"field", "mesh", "radiance", "run", "support"}
-    record = record_of(run)
+    record = read_record(run)
     assert (record["views"], record["held_out"]) == ({"trained": 6, "held_out": 0}, None)
     assert record["texture"] is None
     assert "is finished, so there is nothing to resume" in fails(capsys, f"reconstruct {data} -o {run} --resume")
@@ -251,7 +232,7 @@ def test_a_contradicted_picture_is_left_out(tmp_path: Path, capsys: pytest.Captu
     write_neus(tmp_path / "odd", odd)
     assert main(f"reconstruct {tmp_path / 'odd'} -o {tmp_path / 'run'} {FLAGS} --texture-steps 0".split()) == 0
     assert "left out: image/002.png\n" in capsys.readouterr().err
-    record = record_of(tmp_path / "run")
+    record = read_record(tmp_path / "run")
     assert record["left_out"] == ["image/002.png"]
     assert record["views"] == {"trained": 9, "held_out": 2}
 
@@ -263,7 +244,7 @@ def test_what_is_behind_holes_of_masks_is_not_learnt(tmp_path: Path, monkeypatch
     write_neus(tmp_path / "torn", torn)
     assert main(f"reconstruct {tmp_path / 'torn'} -o {tmp_path / 'run'} {FLAGS} --texture-steps 0".split()) == 0
     missing = (torn.views[3].mask > 0.5) & (torn.views[2].mask <= 0.5)
-    assert record_of(tmp_path / "run")["mask_holes"] == {"image/002.png": missing.sum()}
+    assert read_record(tmp_path / "run")["mask_holes"] == {"image/002.png": missing.sum()}
 
 
 def test_the_command_says_how_to_go_on(
@@ -336,29 +317,23 @@ def test_a_budget_counts_all_but_leaves_most_for_the_training(data: Path, tmp_pa
 
 
 class Glossy(ViewColor):
-    """Paint that is known in closed form, under a lamp that is reflected."""
-
-    def __init__(self) -> None:
-        super().__init__(0, width=1, depth=1)
-
-    def paint(self, x: Tensor) -> Tensor:
-        return 0.3 + 0.4 * x
+    """Paint of 0.3 + 0.4 x, under a lamp that is reflected."""
 
     def forward(self, x: Tensor, direction: Tensor, jet: Any) -> Tensor:
         normal = torch.nn.functional.normalize(jet.gradient, dim=-1)
         halfway = torch.nn.functional.normalize(torch.tensor([0.6, 0.8, 0.0]) - direction, dim=-1)
-        return self.paint(x) + 0.5 * (normal * halfway).sum(dim=-1, keepdim=True).clamp(min=0) ** 40
+        return 0.3 + 0.4 * x + 0.5 * (normal * halfway).sum(dim=-1, keepdim=True).clamp(min=0) ** 40
 
 
 def test_colours_of_the_surface_are_without_highlights() -> None:
-    color = Glossy()
-    model = SceneModel(Sphere(radius=0.5), color, None, torch.zeros(3))
+    model = SceneModel(Sphere(radius=0.5), Glossy(0, width=1, depth=1), None, torch.zeros(3))
     points = 0.5 * torch.from_numpy(fibonacci_directions(500)).float()
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)))[0]
     eyes = 2 * torch.from_numpy(fibonacci_directions(40)).float() @ turn.T
     order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
-    wrong = (surface_colors(model, points, eyes[order]) - color.paint(points)).abs().amax(dim=1)
-    ahead = (surface_colors(model, points, eyes[:2]) - color.paint(points)).abs().amax(dim=1)  # no three eyes
+    wrong, ahead = (  # of which the second has no three eyes
+        (surface_colors(model, points, some) - 0.3 - 0.4 * points).abs().amax(dim=1) for some in (eyes[order], eyes[:2])
+    )
     assert float(ahead.max()) > 0.45  # the highlight, head-on
     # It is 0.5 high where n · h = 1 and half of that 11° away, which turns the eye by twice as much: of nine eyes
     # within 60° some are there, and the third darkest is well off its middle.

@@ -19,7 +19,7 @@ from mplicits.neural_fields import InputError, MultiscaleSDF, Similarity, Siren,
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.cli.train import TEXTURE as COMMAND
 from mplicits.pipelines.texture.train import default_delta, fit_texture, read_colors, texture_of, texture_run
-from mplicits.pipelines.training.folder import TEXTURE_FILE, texture_state_file
+from mplicits.pipelines.training.folder import TEXTURE_FILE, read_record, texture_state_file
 from mplicits.pipelines.training.progress import Lines
 from mplicits.pipelines.training.settings import TextureConfig
 from numpy.typing import NDArray
@@ -153,10 +153,6 @@ def plane_cloud(count: int = 2000, *, colors: bool = True, center: float = 5.0) 
     return PointCloud(points + np.array([center, 0.0, 0.0]), colors=painted(points) if colors else None)
 
 
-def record_of(run: Path) -> dict[str, Any]:
-    return json.loads((run / "run.json").read_text())
-
-
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     directory = tmp_path / "run"
@@ -181,7 +177,7 @@ def test_a_run_gets_its_texture(run: Path, cloud: Path) -> None:
     found = texture_of(run, geometry).value(x)
     assert torch.equal(found, fitted.texture.value(x))
     assert psnr(found, painted(points)) > 30
-    record = record_of(run)
+    record = read_record(run)
     assert record["cloud"] == "plane.ply"
     assert record["texture"] == json.loads(json.dumps(fitted.record))
     assert {path.stem for path in run.iterdir()} == {"field", "run", "texture"}
@@ -200,7 +196,7 @@ def test_an_interrupted_training_leaves_a_usable_texture_and_continues_to_the_sa
     config = replace(SMALL, steps=60)
     whole = texture_run(run, cloud, config, out=run.parent / "whole.safetensors").texture
     texture_run(run, cloud, config, progress=interrupt("texture", 20))
-    record = record_of(run)["texture"]
+    record = read_record(run)["texture"]
     assert not record["finished"]
     assert 20 <= record["steps"] < 60
     partial = texture_of(run, load_field(run / "field.safetensors").field)
@@ -211,7 +207,7 @@ def test_an_interrupted_training_leaves_a_usable_texture_and_continues_to_the_sa
     assert torch.equal(resumed.texture.value(x), whole.value(x))
     assert resumed.record["config"]["steps"] == 60
     assert not texture_state_file(run / TEXTURE_FILE).exists()
-    record = record_of(run)["texture"]
+    record = read_record(run)["texture"]
     assert (record["finished"], record["steps"]) == (True, 60)
 
 
