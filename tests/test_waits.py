@@ -40,9 +40,8 @@ def test_cones_are_looked_at_once_for_each_size_of_tiles() -> None:
 @pytest.mark.parametrize("name", ["value", "jet"])
 def test_fixed_shapes_need_no_wait(name: str) -> None:
     ask = getattr(waits.MultiscaleSDF, name)
-    assert waits.evaluating(name, waits.in_fixed_shapes(ask)).ledger.synchronisations == 0
-    usual = waits.evaluating(name, ask).ledger
-    assert usual.synchronisations == 2  # a look for each residual
+    assert waits.evaluating(name, ask, fixed=True).ledger.synchronisations == 0
+    assert waits.evaluating(name, ask).ledger.synchronisations == 2  # one for each residual
 
 
 def test_training_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import standin
 import torch
@@ -74,11 +75,8 @@ def passes_of(field: type[Field]) -> Iterator[list[int]]:
         asked.append(len(x))
         return value(self, x, level=level)
 
-    field.value = watched
-    try:
+    with mock.patch.object(field, "value", watched):
         yield asked
-    finally:
-        field.value = value
 
 
 def tracing(count: int = 500) -> Row:
@@ -99,25 +97,18 @@ def drawing(size: int = 64) -> Row:
     return Row(f"`trace_view`, {size}², three levels", "picture", 1, ledger)
 
 
-def in_fixed_shapes(ask: Callable[[MultiscaleSDF, Tensor], object]) -> Callable[[MultiscaleSDF, Tensor], object]:
-    def asked(field: MultiscaleSDF, x: Tensor) -> object:
-        with fixed_shapes():
-            return ask(field, x)
-
-    return asked
-
-
-def evaluating(name: str, ask: Callable[[MultiscaleSDF, Tensor], object]) -> Row:
+def evaluating(name: str, ask: Callable[[MultiscaleSDF, Tensor], object], *, fixed: bool = False) -> Row:
+    """One evaluation, in fixed shapes or not."""
     field = three_levels().to(DEVICE)
     x = some_rays(1000)[0].to(DEVICE) * torch.linspace(0.2, 0.3, 1000, device=DEVICE)[:, None]
-    with standin.counted() as ledger:
+    with standin.counted() as ledger, fixed_shapes() if fixed else contextlib.nullcontext():
         ask(field, x)
     return Row(name, "call", 1, ledger)
 
 
 @contextlib.contextmanager
 def counted_steps() -> Iterator[dict[str, list[standin.Ledger]]]:
-    """What each training step inside the ``with`` asks, by stage."""
+    """The counts of each training step inside the ``with``, by stage."""
     step, stages = Trainer._step, {}
 
     def watched(self: Trainer) -> object:
@@ -126,14 +117,11 @@ def counted_steps() -> Iterator[dict[str, list[standin.Ledger]]]:
         stages.setdefault(self.stage, []).append(ledger)
         return result
 
-    Trainer._step = watched
-    try:
+    with mock.patch.object(Trainer, "_step", watched):
         yield stages
-    finally:
-        Trainer._step = step
 
 
-def training(words: str, names: dict[str, str]) -> list[Row]:
+def training(words: str, name: str) -> list[Row]:
     with counted_steps() as stages, contextlib.redirect_stdout(io.StringIO()):
         assert command([*words.split(), "--device", standin.NAME]) == 0
     rows = []
@@ -142,7 +130,7 @@ def training(words: str, names: dict[str, str]) -> list[Row]:
         for ledger in steps:
             together.waits.update(ledger.waits)
             together.launches.update(ledger.launches)
-        rows.append(Row(f"{names['']}, {names.get(stage, stage)}", "step", len(steps), together))
+        rows.append(Row(f"{name}, {stage}", "step", len(steps), together))
     return rows
 
 
@@ -151,15 +139,15 @@ def rows() -> Iterator[Row]:
     yield drawing()
     for name, ask in (("value", MultiscaleSDF.value), ("jet", MultiscaleSDF.jet)):
         yield evaluating(f"`MultiscaleSDF.{name}`", ask)
-        yield evaluating(f"`MultiscaleSDF.{name}` in `fixed_shapes`", in_fixed_shapes(ask))
+        yield evaluating(f"`MultiscaleSDF.{name}` in `fixed_shapes`", ask, fixed=True)
     yield from trainings()
 
 
 def trainings() -> Iterator[Row]:
     write_cloud_ply(Path("scan.ply"), sample_torus(400))
-    yield from training(f"fit scan.ply -o run {FIT}", {"": "`fit`"})
+    yield from training(f"fit scan.ply -o run {FIT}", "`fit`")
     write_neus(Path("photos"), render_scene(SCENES["painted-sphere"](), views=6, size=12, samples=2))
-    yield from training(f"reconstruct photos -o photographed {RECONSTRUCT}", {"": "`reconstruct`"})
+    yield from training(f"reconstruct photos -o photographed {RECONSTRUCT}", "`reconstruct`")
 
 
 def main() -> None:

@@ -29,6 +29,13 @@ def cloud() -> CloudDistance:
     return CloudDistance(*sphere_points(20_000))
 
 
+def sphere_below(top: float, count: int = 20_000, **options: float) -> CloudDistance:
+    """A sphere whose cap above ``top`` of its radius was not scanned."""
+    points, normals = sphere_points(count)
+    seen = normals[:, 2] < top
+    return CloudDistance(points[seen], normals[seen], **options)
+
+
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
@@ -59,16 +66,13 @@ def test_winding_numbers_tell_inside_from_outside_through_a_hole() -> None:
 
 def test_beside_the_rim_of_a_hole_discs_that_agree_go_on_where_the_surface_ends() -> None:
     """A bowl: in its opening winding numbers are one half, whatever is beside the rim."""
-    points, normals = sphere_points(40_000)
-    below = points[:, 2] < 0
-    bowl = CloudDistance(points[below], normals[below])
+    bowl = sphere_below(0.0, 40_000)
     beside = torch.tensor([[0.95, 0.0, 0.03], [0.0, 0.95, 0.03], [-0.92, 0.0, 0.05]]) * RADIUS  # within the sphere
     doubt = 0.5 - bowl.winding_number(beside.numpy())
     assert ((doubt > 0) & (doubt < CLOUD.doubt)).all()
     assert (bowl.signed(beside) < 0).all()
     # Not of points that fill a sparse cloud in, which may go on beyond an edge.
-    filled = CloudDistance(points[below], normals[below], given=1)
-    assert (filled.signed(beside) > 0).all()
+    assert (sphere_below(0.0, 40_000, given=1).signed(beside) > 0).all()
     # Beyond the rim's reach, and where its discs are seen edge-on, nothing is better than winding numbers.
     remote = torch.tensor([[0.1, 0.0, 0.05], [0.0, 0.5, -0.05]]) * RADIUS
     turn = torch.linspace(0, 2 * np.pi, 50)
@@ -217,24 +221,15 @@ def test_empty_places_are_where_a_level_invents_a_surface(cloud: CloudDistance) 
     assert (exact - found.value.abs() > 0.045).all()
 
 
-def with_hole() -> CloudDistance:
-    """A sphere whose cap above z = 0.8 of its radius was not scanned."""
-    points, normals = sphere_points(20_000)
-    seen = normals[:, 2] < 0.8
-    return CloudDistance(points[seen], normals[seen])
-
-
 def test_places_in_less_doubt_are_empty_where_normals_are_guesses() -> None:
     """In the mouth of a bowl the winding number is between; guesses are believed from 0.2 and 0.8 on."""
-    points, normals = sphere_points(20_000)
-    seen = normals[:, 2] < 0.3
     level, found = Sphere(radius=RADIUS), {}
     for guessed in (False, True):
-        bowl = CloudDistance(points[seen], normals[seen], guessed=guessed)
+        bowl = sphere_below(0.3, guessed=guessed)
         found[guessed] = module.remote_samples(bowl, level, 0.05, 40_000, generator=generator(), device=CPU)
         for places, sure in ((found[guessed].empty, True), (found[guessed].unseen, False)):
             depth = np.abs(bowl.winding_number(places.points.numpy()) - 0.5)
-            # Which dipoles count one by one depends on which places are asked for together.
+            # Which dipoles count one by one depends on the places of one call.
             least = (module.SAMPLING.sure_guessed if guessed else module.SAMPLING.sure) + (-FAR if sure else FAR)
             assert ((depth > least) == sure).all()
     assert len(found[True].empty) > len(found[False].empty)
@@ -244,8 +239,8 @@ def test_places_in_less_doubt_are_empty_where_normals_are_guesses() -> None:
 def test_a_level_keeps_what_was_not_scanned(cloud: CloudDistance) -> None:
     """In the hole, and only there, more than δ from its rim, with the value of the level before."""
     level, delta = Sphere(radius=RADIUS - 0.01), 0.05
-    assert len(empty(with_hole(), Sphere(radius=RADIUS))) == 0
-    found = module.remote_samples(with_hole(), level, delta, 40_000, generator=generator(), device=CPU).unseen
+    assert len(empty(sphere_below(0.8), Sphere(radius=RADIUS))) == 0
+    found = module.remote_samples(sphere_below(0.8), level, delta, 40_000, generator=generator(), device=CPU).unseen
     assert len(found) > 1000
     assert torch.equal(found.distance, level.value(found.points))
     up = found.points[:, 2] / found.points.norm(dim=1)
@@ -268,7 +263,10 @@ def with_next_level(cloud: CloudDistance, previous: MultiscaleSDF, omega: float,
 
 @pytest.mark.slow
 def test_the_next_level_leaves_the_closing_of_a_hole_as_it_is() -> None:
-    cloud, previous = with_hole(), MultiscaleSDF(Sphere(radius=RADIUS + 0.02), [], [])  # off by 0.02 at the points
+    cloud, previous = (
+        sphere_below(0.8),
+        MultiscaleSDF(Sphere(radius=RADIUS + 0.02), [], []),
+    )  # off by 0.02 at the points
     names, field = with_next_level(cloud, previous, 40.0, 100)
     assert names == ["surface", "offset", "band", "unseen"]
     aside = torch.nn.functional.normalize(torch.randn(500, 2, generator=generator()), dim=1)
@@ -390,10 +388,8 @@ def test_a_band_is_no_wider_than_the_one_before() -> None:
 def widened(field: Field, delta: float) -> module.Band:
     """The band of a field that was fitted to a sphere of radius 0.5."""
     cloud = CloudDistance(*sphere_points(10_000, 0.5))
-    where = {"count": 400_000, "seed": 0, "device": CPU}
-    return module.with_wrong_sides(
-        module.Band(delta, "maximum", 1), torch.tensor([delta]), cloud, field, epsilon=0.05, **where
-    )
+    band, options = module.Band(delta, "maximum", 1), {"epsilon": 0.05, "count": 400_000, "seed": 0, "device": CPU}
+    return module.with_wrong_sides(band, torch.tensor([delta]), cloud, field, **options)
 
 
 @pytest.mark.parametrize("radius", [0.5, 0.52, 0.48])
@@ -406,7 +402,7 @@ def test_a_level_that_is_right_keeps_the_band_of_its_points(radius: float) -> No
     [(0.12, 1.05 * 0.2), (0.06, module.BAND.widest * 0.06), pytest.param(0.21, 0.21, marks=pytest.mark.slow)],
 )
 def test_a_band_holds_what_a_level_puts_on_the_wrong_side(delta: float, expected: float) -> None:
-    """A ball of radius 0.2 hangs beside the sphere: 0.2 deep. Of the places in it the deepest is asked, nearly."""
+    """A ball of radius 0.2 hangs beside the sphere: 0.2 deep. The deepest place in it decides, nearly."""
     band = widened(Union(Sphere(radius=0.5), Sphere(radius=0.2, center=(0.8, 0.0, 0.0))), delta)
     assert 0.8 * expected < band.delta <= expected * (1 + 1e-6)
     assert (band.rule == "places on the wrong side") == (delta < 0.2)

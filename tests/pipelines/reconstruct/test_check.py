@@ -25,6 +25,7 @@ from mplicits.pipelines.surface.surface import read_surface
 from reconstructions import painted_sphere, with_views, without
 
 WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}
+VIEWS = 10  # of the figure with depth maps
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +207,7 @@ def test_masks_with_holes(figure):
         assert not hole[torn.views[index].mask > 0.5].any()
         assert (hole & ~missing).sum() < 0.2 * missing.sum()
     assert Agreement.of(torn.views, torn.similarity).outliers() == []  # the rest of those pictures is right
-    few = replace(torn, views=torn.views[:12])  # of which each may cut much
+    few = replace(torn, views=torn.views[:12])  # each of these may cut much
     assert Agreement.of(few.views, few.similarity).holes() == {}
     notch = np.array(figure.views[2].mask)
     notch[20:44, :32] = 0  # open to the border: it may be the outline
@@ -330,6 +331,7 @@ def test_mistakes_end_in_one_line(tmp_path, capsys, good, words, message):
 
 @pytest.mark.parametrize("form", ["transforms", pytest.param("colmap-text", marks=pytest.mark.slow)])
 def test_scenes_come_with_their_truth(tmp_path, capsys, form):
+    assert set(SCENE_NAMES) == set(SCENES)
     folder = tmp_path / "scene"
     command = ["scene", "striped-torus", "-o", str(folder), "--format", form]
     assert main([*command, "--views", "6", "--size", "16", "--samples", "1"]) == 0
@@ -343,13 +345,6 @@ def test_scenes_come_with_their_truth(tmp_path, capsys, form):
     assert truth.colors is not None
     assert main(command) == 2  # nothing is overwritten
     assert "is not empty" in capsys.readouterr().err
-
-
-def test_the_command_knows_every_scene():
-    assert set(SCENE_NAMES) == set(SCENES)
-
-
-VIEWS = 10
 
 
 @pytest.fixture(scope="module")

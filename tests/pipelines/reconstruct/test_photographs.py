@@ -45,9 +45,8 @@ def test_a_photograph_changes_the_object_and_not_a_known_background() -> None:
     """g (C) + α o + (1 − α) b of C = α c, the object's share."""
     model, opacity = exact_model(500.0, Exposures(2)), torch.tensor([1.0, 0.25, 0.0])
     share, color = opacity[:, None], torch.tensor([0.2, 0.4, 0.6])
-    seen = Rendered(*[torch.zeros(3)] * len(Rendered._fields))._replace(
-        color=share * color + (1 - share), opacity=opacity
-    )
+    nothing = Rendered(*[torch.zeros(3)] * len(Rendered._fields))
+    seen = nothing._replace(color=share * color + (1 - share), opacity=opacity)
     with torch.no_grad():
         model.exposures.logs[0], model.exposures.shifts[0] = math.log(4.0), torch.tensor([0.2, 0.0, -0.2])
     gain, offset = 2.0, torch.tensor([0.1, 0.0, -0.1])  # their means over both views are taken off

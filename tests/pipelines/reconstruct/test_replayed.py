@@ -1,4 +1,4 @@
-"""Steps of a scene that are replayed: those that would be done, in rooms that follow what is asked for."""
+"""Replayed steps of a scene: the same as usual ones, with buffers that follow the counts of samples."""
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace

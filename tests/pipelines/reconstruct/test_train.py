@@ -297,7 +297,7 @@ def test_a_painted_sphere_is_recovered_from_its_pictures(tmp_path: Path) -> None
     run = reconstruct(tmp_path / "data", config)
     assert "masks" in run.images.region
     mesh = extract_mesh(run.model.geometry, resolution=128)
-    # What is beyond the region of interest was in nobody's view.
+    # What is beyond the region of interest was in no view.
     seen = mesh.vertices[np.linalg.norm(mesh.vertices, axis=1) < 1]
     here = WORLD.to_unit(run.images.similarity.to_input(seen))
     assert abs(np.linalg.norm(here, axis=1) - 0.6).mean() < 0.004

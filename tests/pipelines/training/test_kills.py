@@ -39,10 +39,6 @@ def field(number: int) -> Siren:
     return made
 
 
-def number_of(run: Path) -> int:
-    return int(load_field(runs.find_field(run)).field.output.bias)
-
-
 def write_run(run: Path, first: int) -> None:
     """Two checkpoints and the end of a run, whose files all hold the number of the step."""
     folder = RunFolder(run)
@@ -60,7 +56,7 @@ def check_one_run(run: Path) -> int | None:
     if not (run / "run.json").is_file() and not (run / ".journal").is_file():
         runs.check_new_run(run, resume=False, force=False)  # nothing that could be lost
         return None
-    step = number_of(run)
+    step = int(load_field(runs.find_field(run)).field.output.bias)
     record = runs.read_record(run)
     assert record["step"] == step
     assert load_field(runs.find_field(run)).metadata["run"]["generation"] == record["generation"]
@@ -83,12 +79,6 @@ def check_one_run(run: Path) -> int | None:
     return step
 
 
-def operations(run: Path, first: int) -> int:
-    with Faults().injected() as faults:
-        write_run(run, first)
-    return faults.count
-
-
 @pytest.fixture(autouse=True)
 def _quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files are read back from memory here, so that nothing needs to be on the disk."""
@@ -103,7 +93,9 @@ def test_every_operation_may_be_the_last(tmp_path: Path, every: int, force: bool
     whole, seen = tmp_path / "whole", set()
     write_run(whole, 0)
     shutil.copytree(whole, tmp_path / "counted")
-    for at in range(0, operations(tmp_path / "counted", 10), every):
+    with Faults().injected() as faults:
+        write_run(tmp_path / "counted", 10)
+    for at in range(0, faults.count, every):
         run = tmp_path / f"{at}"
         if force:
             shutil.copytree(whole, run)
