@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 Module = TypeVar("Module", bound=nn.Module)
-
+Tensors = Tensor | Sequence[Tensor]
 
 # Sensitivities are differences over a relative change of this size, in float64: far above rounding, far below a period.
 CHANGE = 1e-6
@@ -25,26 +25,17 @@ def unit_roundoff(dtype: torch.dtype) -> float:
 
 
 def rounding(field: Module, x: Tensor, evaluate: Callable[[Module, Tensor], Sequence[Tensor]]) -> list[Tensor]:
-    """How far results computed in the precision of ``x`` may be from the exact ones, entry by entry.
+    """A bound on the rounding errors of results that are computed in the precision of ``x``, entry by entry.
 
-    An inner product of n terms, summed in any order, in blocks, with or without fused multiply-add, is the exact one
-    of weights that are changed relatively by at most γ_n = n u / (1 − n u) each (Higham 2002, Sec. 3.1). Much the same
-    holds for a rounded point, a sum with a bias, and a sine that is right to a few units in the last place. So a
-    network in floating point is an exact network of other weights, at another point, and what is asked is how much
-    those matter. That is measured in float64: every parameter and every coordinate is multiplied by 1 ± ε with random
-    signs; the change of the result, divided by ε and multiplied by n u, is what changes of γ_n do to it. Depth, ω₀,
-    gates and the size of the weights are all in it.
-
-    The signs are random, so a result that happens to change by little in all draws is given the median change of all
-    results. Where a gate opens or a box has an edge within ε, the bound is as large as the jump.
-
-    Args:
-        field: or any other module, in any precision; it is not changed.
-        x: the points.
-        evaluate: the field at the points → results of any shapes, floating point all of them.
+    A sum of n products, in any order, is the exact sum for weights that differ by at most γ_n = n u / (1 − n u) each
+    (Higham 2002, Sec. 3.1). Rounded points, biases and sines are much the same. So a network in floating point is an
+    exact network of other weights, at another point. The effect is measured in float64. All parameters and coordinates
+    are multiplied by 1 ± ε with random signs; the change of the result is divided by ε and multiplied by n u. A result
+    that changes by little in all draws gets the median change of all results. Where a gate opens or a box has an edge
+    within ε, the bound is as large as the jump.
 
     Returns:
-        A bound for each entry of each result, in float64, on the CPU: it is of numbers, wherever they are worked on.
+        A bound for each entry of each result of ``evaluate(field, x)``, in float64, on the CPU.
     """
     exact = copy.deepcopy(field).cpu().double().requires_grad_(False)
     points = x.detach().cpu().double()
@@ -71,10 +62,14 @@ def rounding(field: Module, x: Tensor, evaluate: Callable[[Module, Tensor], Sequ
     ]
 
 
-def assert_within(actual: Tensor, expected: Tensor, bound: Tensor | float) -> None:
-    """|actual − expected| ≤ bound, entry by entry; the message says how many times too far the worst one is."""
+def assert_within(actual: Tensors, expected: Tensors, bound: float | Tensors, times: float = 1.0) -> None:
+    """|actual − expected| ≤ times · bound, entry by entry; of sequences, one after the other."""
+    if not isinstance(actual, Tensor):
+        for found, other, most in zip(actual, expected, bound, strict=True):
+            assert_within(found, other, most, times)
+        return
     assert actual.shape == expected.shape
     difference = (actual.detach().double() - expected.detach().double()).abs().cpu()
     if difference.numel():
-        worst = float((difference / torch.as_tensor(bound).cpu().clamp(min=1e-300)).max())
+        worst = float((difference / (times * torch.as_tensor(bound)).cpu().clamp(min=1e-300)).max())
         assert worst <= 1, f"{worst:.3g} times as far apart as allowed; at most {float(difference.max()):.3g} apart"

@@ -31,17 +31,8 @@ BRIEF = EvolveConfig(
     resolution=24,
     least_delta=0.05,
 )
-QUICK = replace(
-    BRIEF,
-    widths=(32,),
-    depths=(2,),
-    omegas=(6.0,),
-    steps=(250,),
-    learning_rates=(5e-3,),
-    data_weights=(100.0,),
-    batch=768,
-    samples=8000,
-)
+ONE_LEVEL = {"widths": (32,), "depths": (2,), "omegas": (6.0,), "learning_rates": (5e-3,), "data_weights": (100.0,)}
+QUICK = replace(BRIEF, **ONE_LEVEL, steps=(250,), batch=768, samples=8000)
 
 
 def few_points(patch: pytest.MonkeyPatch) -> None:
@@ -53,13 +44,7 @@ def few_points(patch: pytest.MonkeyPatch) -> None:
 
 
 def ball(path: Path, radius: float, *, levels: bool = False) -> None:
-    """A fit of a ball around (5, 0, 0), twice as large in input coordinates; off by less than 0.01.
-
-    Args:
-        path: of the file.
-        radius: in unit-sphere coordinates.
-        levels: whether it is a multiscale field of one level, as those that `fit` makes.
-    """
+    """A fit of a ball around (5, 0, 0), twice as large in input coordinates; a multiscale field with ``levels``."""
     siren = Siren(24, 2, omega=3.0)
     adam = torch.optim.Adam(siren.parameters(), lr=1e-2, betas=(0.9, 0.99))
     for step in range(200):

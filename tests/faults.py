@@ -1,10 +1,8 @@
-"""A disk that fails, or a process that is killed, at a chosen one of the operations that change a disk for good.
+"""A disk that fails, or a process that is killed, at a chosen operation of `neural_fields.backend.files`.
 
-Every such operation of the package goes through `neural_fields.backend.files`. `Faults` counts them, and at one of them
-
-- "killed": nothing of it happens, nor of any that would follow: no clean-up, as after SIGKILL or a power cut;
-- "torn": half of it happens, if it is a write, and nothing after it;
-- "full": it raises that the disk is full, once; what follows works.
+- "killed": that operation and all after it do not happen, as after SIGKILL or a power cut.
+- "torn": half of it happens, if it is a write, and nothing after it.
+- "full": it raises that the disk is full, once. What follows works.
 """
 
 from __future__ import annotations
@@ -30,22 +28,13 @@ class Killed(BaseException):
 
 
 class Faults:
-    """Operations of a block, counted, one of which goes wrong.
-
-    Args:
-        at: the number of that one, from 0; None for none.
-        kind: one of `KINDS`.
-
-    Attributes:
-        count: how many there have been.
-    """
+    """Operations of a block, counted; the one with the number ``at`` goes wrong, if there is one."""
 
     def __init__(self, at: int | None = None, kind: str = "killed") -> None:
         self.at, self.kind, self.count, self.dead = at, kind, 0, False
 
     @contextmanager
     def injected(self) -> Iterator[Faults]:
-        """A block in which they count and fail."""
         with pytest.MonkeyPatch.context() as patch:
             for name in OPERATIONS:
                 patch.setattr(disk, name, self._instead(name, getattr(disk, name)))

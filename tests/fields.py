@@ -2,29 +2,8 @@
 
 from collections.abc import Callable
 
+import mplicits.neural_fields as nf
 import torch
-from mplicits.neural_fields import (
-    Box,
-    Capsule,
-    Difference,
-    Field,
-    FunctionField,
-    Intersection,
-    Jet,
-    Moving,
-    MultiscaleSDF,
-    Offset,
-    Plane,
-    RigidMotion,
-    Shell,
-    Similarity,
-    Siren,
-    SpaceTimeSDF,
-    Sphere,
-    TimeSlice,
-    Torus,
-    Union,
-)
 from mplicits.neural_fields.fields.csg import Bounded, Placed
 from mplicits.neural_fields.fields.field import SecondJet
 from mplicits.neural_fields.networks.encoded import EncodedField
@@ -32,39 +11,50 @@ from mplicits.neural_fields.networks.grids import HashEncoding
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
+from mplicits.neural_fields.tracing.sphere import Hits
 from torch import Tensor
 
 from benchmarks.motion.figures import DeformingField, Twisting
 from benchmarks.peers import BaconSDF, BandLimited, BanfSDF, HashGridSDF
 
 
-def small_multiscale(taper: float = 0.0) -> MultiscaleSDF:
+def cube(*shape: int, dim: int = 3, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Random points of the cube [−1, 1]ᵈ, ``(*shape, d)``."""
+    return 2 * torch.rand(*shape, dim, dtype=dtype) - 1
+
+
+def sphere_depth(origins: Tensor, directions: Tensor, radius: float, center: Tensor | float = 0.0) -> Tensor:
+    """Where rays of unit directions enter a sphere; infinite for those that miss it."""
+    along = ((center - origins) * directions).sum(dim=-1)
+    squared = radius**2 - (origins - center + along[..., None] * directions).square().sum(dim=-1)
+    return torch.where(squared > 0, along - squared.clamp(min=0).sqrt(), torch.inf)
+
+
+def assert_depths(hits: Hits, expected: Tensor | Hits, tolerance: float) -> None:
+    """Rays hit where the expected depth is finite, or the expected hits are, and at that depth."""
+    if not isinstance(expected, Tensor):
+        expected = torch.where(expected.mask, expected.depth, torch.inf)
+    assert torch.equal(hits.mask, expected.isfinite())
+    assert bool(((hits.depth - expected)[hits.mask].abs() < tolerance).all())
+
+
+SIZES = [(16, 2), (24, 2), (32, 1)]
+SMALL = {"omegas": [3, 5, 8], "deltas": [0.3, 0.2], "num_features": 2, "residual_gain": 1.0}
+
+
+def small_multiscale(taper: float = 0.0) -> nf.MultiscaleSDF:
     """Three untrained levels whose bands cut the unit cube into parts of comparable size."""
-    return MultiscaleSDF.from_widths(
-        [(16, 2), (24, 2), (32, 1)],
-        omegas=[3, 5, 8],
-        deltas=[0.3, 0.2],
-        taper=taper,
-        num_features=2,
-        residual_gain=1.0,
-    )
+    return nf.MultiscaleSDF.from_widths(SIZES, taper=taper, **SMALL)
 
 
-def two_levels() -> MultiscaleSDF:
+def two_levels() -> nf.MultiscaleSDF:
     """Level 1 refines a closed form, by a lot."""
-    return MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=5.0)], [0.1], taper=0.3)
+    return nf.MultiscaleSDF(nf.Sphere(radius=0.5), [nf.Siren(16, 2, omega=5.0)], [0.1], taper=0.3)
 
 
-def small_spacetime(taper: float = 0.0) -> SpaceTimeSDF:
+def small_spacetime(taper: float = 0.0) -> nf.SpaceTimeSDF:
     """`small_multiscale` in space-time."""
-    return SpaceTimeSDF.from_widths(
-        [(16, 2), (24, 2), (32, 1)],
-        omegas=[3, 5, 8],
-        deltas=[0.3, 0.2],
-        taper=taper,
-        num_features=2,
-        residual_gain=1.0,
-    )
+    return nf.SpaceTimeSDF.from_widths(SIZES, taper=taper, **SMALL)
 
 
 def small_hash_grid() -> HashGridSDF:
@@ -82,10 +72,10 @@ def small_encoded() -> EncodedField:
     return field
 
 
-class Watched(Field):
-    """A field that remembers at which points it was asked, for values or for jets."""
+class Watched(nf.Field):
+    """A field that records the points of its evaluations, of values and of jets."""
 
-    def __init__(self, inner: Field) -> None:
+    def __init__(self, inner: nf.Field) -> None:
         super().__init__()
         self.inner, self.in_dim, self.num_levels = inner, inner.in_dim, inner.num_levels
         self.register_buffer("deltas", inner.deltas)
@@ -96,7 +86,7 @@ class Watched(Field):
         self.values.append(x)
         return self.inner.value(x, level=level)
 
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+    def jet(self, x: Tensor, *, level: int = -1) -> nf.Jet:
         self.jets.append(x)
         return self.inner.jet(x, level=level)
 
@@ -105,15 +95,13 @@ class Watched(Field):
         return self.inner.second_jet(x, level=level, dims=dims)
 
     def counts(self) -> tuple[int, int]:
-        """How many points so far, for values and for jets."""
-        values, jets = (sum(x.shape[:-1].numel() for x in asked) for asked in (self.values, self.jets))
-        return values, jets
+        return sum(x[..., 0].numel() for x in self.values), sum(x[..., 0].numel() for x in self.jets)
 
 
-class Scaled(Field):
+class Scaled(nf.Field):
     """``factor · f``, whose gradient is not of unit length."""
 
-    def __init__(self, inner: Field, factor: float) -> None:
+    def __init__(self, inner: nf.Field, factor: float) -> None:
         super().__init__()
         self.inner, self.factor, self.in_dim, self.num_levels = inner, factor, inner.in_dim, inner.num_levels
         self.register_buffer("deltas", inner.deltas.clone())
@@ -121,60 +109,61 @@ class Scaled(Field):
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         return self.factor * self.inner.value(x, level=level)
 
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+    def jet(self, x: Tensor, *, level: int = -1) -> nf.Jet:
         value, gradient, features = self.inner.jet(x, level=level)
-        return Jet(self.factor * value, self.factor * gradient, features)
+        return nf.Jet(self.factor * value, self.factor * gradient, features)
 
 
 # Turns and travels, about an axis off the origin.
-SCREW = RigidMotion(axis=(1.0, 2.0, -1.0), angle=1.5, center=(0.1, -0.2, 0.0), velocity=(0.3, 0.0, -0.2))
+SCREW = nf.RigidMotion(axis=(1.0, 2.0, -1.0), angle=1.5, center=(0.1, -0.2, 0.0), velocity=(0.3, 0.0, -0.2))
 
-FIELDS: dict[str, Callable[[], Field]] = {
-    "sphere": lambda: Sphere(radius=0.6, center=(0.1, 0.0, -0.1)),
-    "plane": lambda: Plane(normal=(1.0, 2.0, 2.0), offset=0.1),
-    "torus": lambda: Torus(major=0.5, minor=0.2),
-    "box": lambda: Box(half_size=(0.5, 0.3, 0.4)),
-    "capsule": lambda: Capsule(start=(-0.3, 0.0, 0.0), end=(0.3, 0.2, 0.1), radius=0.2),
-    "union": lambda: Union(Sphere(radius=0.3, center=(-0.3, 0, 0)), Sphere(radius=0.3, center=(0.3, 0, 0))),
-    "union-of-moving": lambda: Union(Moving(Sphere(radius=0.3), SCREW), ShrinkingSphere(radius=0.5, alpha=0.05)),
-    "smooth-union": lambda: Union(Sphere(radius=0.4), Box(), Torus(), smooth=0.3),
-    "intersection": lambda: Intersection(Sphere(radius=0.6), Box(half_size=(0.5, 0.5, 0.3)), Plane()),
-    "difference-of-multiscale": lambda: Difference(small_multiscale(0.4), Sphere(radius=0.4), small_multiscale()),
-    "smooth-union-of-multiscale": lambda: Union(two_levels(), small_multiscale(0.4), smooth=0.1),
-    "offset": lambda: Offset(small_multiscale(0.4), -0.05),
-    "shell": lambda: Shell(small_multiscale(0.4), inside=0.1, outside=0.05),
-    "shell-of-moving": lambda: Shell(Moving(small_multiscale(), SCREW), inside=0.1),
-    "placed": lambda: Placed(small_multiscale(0.4), Similarity((0.2, 0.1, -0.1), 0.7)),
+FIELDS: dict[str, Callable[[], nf.Field]] = {
+    "sphere": lambda: nf.Sphere(radius=0.6, center=(0.1, 0.0, -0.1)),
+    "plane": lambda: nf.Plane(normal=(1.0, 2.0, 2.0), offset=0.1),
+    "torus": lambda: nf.Torus(major=0.5, minor=0.2),
+    "box": lambda: nf.Box(half_size=(0.5, 0.3, 0.4)),
+    "capsule": lambda: nf.Capsule(start=(-0.3, 0.0, 0.0), end=(0.3, 0.2, 0.1), radius=0.2),
+    "union": lambda: nf.Union(nf.Sphere(radius=0.3, center=(-0.3, 0, 0)), nf.Sphere(radius=0.3, center=(0.3, 0, 0))),
+    "union-of-moving": lambda: nf.Union(
+        nf.Moving(nf.Sphere(radius=0.3), SCREW), ShrinkingSphere(radius=0.5, alpha=0.05)
+    ),
+    "smooth-union": lambda: nf.Union(nf.Sphere(radius=0.4), nf.Box(), nf.Torus(), smooth=0.3),
+    "intersection": lambda: nf.Intersection(nf.Sphere(radius=0.6), nf.Box(half_size=(0.5, 0.5, 0.3)), nf.Plane()),
+    "difference-of-multiscale": lambda: nf.Difference(small_multiscale(0.4), nf.Sphere(radius=0.4), small_multiscale()),
+    "smooth-union-of-multiscale": lambda: nf.Union(two_levels(), small_multiscale(0.4), smooth=0.1),
+    "offset": lambda: nf.Offset(small_multiscale(0.4), -0.05),
+    "shell": lambda: nf.Shell(small_multiscale(0.4), inside=0.1, outside=0.05),
+    "shell-of-moving": lambda: nf.Shell(nf.Moving(small_multiscale(), SCREW), inside=0.1),
+    "placed": lambda: Placed(small_multiscale(0.4), nf.Similarity((0.2, 0.1, -0.1), 0.7)),
     "bounded": lambda: Bounded(small_multiscale(0.4), radius=0.8),
-    "function": lambda: FunctionField(lambda x: x.norm(dim=-1) - 0.5),
-    "siren": lambda: Siren(24, 2, omega=4.0),
-    "siren-deep-features": lambda: Siren(16, 4, omega=4.0, num_features=3),
-    "siren-one-layer-4d": lambda: Siren(16, 1, omega=4.0, in_dim=4),
+    "function": lambda: nf.FunctionField(lambda x: x.norm(dim=-1) - 0.5),
+    "siren": lambda: nf.Siren(24, 2, omega=4.0),
+    "siren-deep-features": lambda: nf.Siren(16, 4, omega=4.0, num_features=3),
+    "siren-one-layer-4d": lambda: nf.Siren(16, 1, omega=4.0, in_dim=4),
     "neus": lambda: NeusSDF(48, 4, num_features=3),
     "bacon": lambda: BaconSDF(12, bands=(1, 1, 2, 2), outputs=(3,)),
     "hash-grid": small_hash_grid,
     "band-limited": lambda: BandLimited(small_hash_grid(), 6),
-    "banf": lambda: BanfSDF([Torus(major=0.5, minor=0.2)], [12]),
+    "banf": lambda: BanfSDF([nf.Torus(major=0.5, minor=0.2)], [12]),
     "multiscale": small_multiscale,
     "multiscale-tapered": lambda: small_multiscale(0.4),
     "multiscale-over-sphere": two_levels,
     "encoded": small_encoded,
     "spacetime": small_spacetime,
     "spacetime-tapered": lambda: small_spacetime(0.4),
-    "slice": lambda: TimeSlice(small_spacetime(0.4), 0.3),
+    "slice": lambda: nf.TimeSlice(small_spacetime(0.4), 0.3),
     "slice-at": lambda: small_spacetime().at(0.3),
-    "slice-of-moving": lambda: TimeSlice(Moving(Torus(major=0.5, minor=0.2), SCREW), 0.7),
-    "deforming": lambda: DeformingField(Torus(major=0.5, minor=0.2), Twisting(angle=0.8, half=2.0)),
-    "moving": lambda: Moving(Torus(major=0.5, minor=0.2), SCREW),
-    "moving-multiscale": lambda: Moving(small_multiscale(0.4), SCREW),
+    "slice-of-moving": lambda: nf.TimeSlice(nf.Moving(nf.Torus(major=0.5, minor=0.2), SCREW), 0.7),
+    "deforming": lambda: DeformingField(nf.Torus(major=0.5, minor=0.2), Twisting(angle=0.8, half=2.0)),
+    "moving": lambda: nf.Moving(nf.Torus(major=0.5, minor=0.2), SCREW),
+    "moving-multiscale": lambda: nf.Moving(small_multiscale(0.4), SCREW),
     "shrinking-sphere": lambda: ShrinkingSphere(radius=0.8, alpha=0.1),
     "growing-sphere-exact-law": lambda: ShrinkingSphere(radius=0.8, alpha=-0.001, exact_law=True),
-    "keyframes": lambda: Keyframes([-0.4, 0.1, 0.5], [Sphere(radius=0.3), small_multiscale(0.4), Torus()]),
+    "keyframes": lambda: Keyframes([-0.4, 0.1, 0.5], [nf.Sphere(radius=0.3), small_multiscale(0.4), nf.Torus()]),
     "carried-keyframes": lambda: CarriedKeyframes(
-        Keyframes([-0.4, 0.1, 0.5], [Sphere(radius=0.3), small_multiscale(0.4), Torus()]),
+        Keyframes([-0.4, 0.1, 0.5], [nf.Sphere(radius=0.3), small_multiscale(0.4), nf.Torus()]),
         VelocitySiren(16, 2, gain=0.5),
     ),
 }
-EXACT = {
-    name: FIELDS[name] for name in ("sphere", "plane", "torus", "box", "capsule", "slice-of-moving")
-}  # signed distances everywhere, not only signs
+# Signed distances everywhere, not only signs.
+EXACT = {name: FIELDS[name] for name in ("sphere", "plane", "torus", "box", "capsule", "slice-of-moving")}

@@ -39,8 +39,6 @@ class Separate(nn.Module):
 
 
 class NeuSHost:
-    """NeuS's renderer and runner."""
-
     def __init__(self, geometry: NeuSGeometry | Separate, features: int) -> None:
         self.geometry = geometry
         self.color = nn.Sequential(nn.Linear(9 + features, 16), nn.ReLU(), nn.Linear(16, 3), nn.Sigmoid())
@@ -77,20 +75,8 @@ class NeuSHost:
         return (rendered - wanted).abs().mean() + 0.1 * eikonal
 
 
-class Heads(enum.Enum):
-    RGB = "rgb"
-    SDF = "sdf"
-    NORMALS = "normals"
-    GRADIENT = "gradient"
-    ALPHA = "alpha"
-
-
-class OldHeads(enum.Enum):
-    RGB = "rgb"
-    SDF = "sdf"
-    NORMAL = "normal"
-    GRADIENT = "gradient"
-    ALPHA = "alpha"
+Heads = enum.Enum("Heads", ["RGB", "SDF", "NORMALS", "GRADIENT", "ALPHA"])
+OldHeads = enum.Enum("OldHeads", ["RGB", "SDF", "NORMAL", "GRADIENT", "ALPHA"])
 
 
 @dataclass

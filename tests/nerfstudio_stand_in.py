@@ -1,11 +1,8 @@
-"""The part of nerfstudio that our methods touch, in small, so that they can be tried where it is not installed.
-
-Configurations keep what they are given; the model asks its field what nerfstudio's asks it in a step.
-"""
+"""The part of nerfstudio that our methods use, so that they can be tested where it is not installed."""
 
 import enum
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -58,12 +55,8 @@ class Model(nn.Module):
         self.populate_modules()
 
     def populate_modules(self) -> None:
-        self.field = self.config.sdf_field.setup(
-            aabb=self.scene_box.aabb,
-            spatial_distortion=None,
-            num_images=self.num_train_data,
-            use_average_appearance_embedding=False,
-        )
+        options = {"spatial_distortion": None, "use_average_appearance_embedding": False}
+        self.field = self.config.sdf_field.setup(aabb=self.scene_box.aabb, num_images=self.num_train_data, **options)
         self.lpips = sys.modules["torchmetrics.image.lpip"].LearnedPerceptualImagePatchSimilarity()
         self.anneal_end = 50000
 
@@ -85,7 +78,6 @@ class Model(nn.Module):
         return (outputs[Heads.RGB] - 0.5).abs().mean() + outputs[Heads.ALPHA].mean() + 0.1 * eikonal
 
 
-@dataclass
 class SchedulerConfig(Config):
     pass
 
@@ -98,7 +90,7 @@ class Scheduler:
 @dataclass
 class Specification:
     config: Any = None
-    description: str = field(default="")
+    description: str = ""
 
 
 MODULES: dict[str, dict[str, Any]] = {

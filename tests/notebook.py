@@ -1,8 +1,6 @@
-"""A notebook from a script in the percent format: ``# %%`` begins a cell, ``# %% [markdown]`` one of words.
+"""A notebook from a script in the percent format, written beside it: ``python tests/notebook.py SCRIPT.py``.
 
-    python tests/notebook.py docs/tutorials/what_a_field_answers.py
-
-writes the .ipynb beside the script. Jupyter is not needed, neither to write it nor to run its cells.
+``# %%`` begins a cell, ``# %% [markdown]`` one of words. Jupyter is not needed.
 """
 
 import json
@@ -31,10 +29,8 @@ def notebook_of(script: str) -> str:
         made = {"cell_type": kind, "id": f"cell-{index}", "metadata": {}, "source": source.splitlines(keepends=True)}
         return made if kind == "markdown" else made | {"execution_count": None, "outputs": []}
 
-    metadata = {
-        "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
-        "language_info": {"name": "python"},
-    }
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
     cells = [cell(index, kind, source) for index, (kind, source) in enumerate(cells_of(script))]
     content = {"cells": cells, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"

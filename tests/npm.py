@@ -16,10 +16,9 @@ def fetch(folder: Path, package: str) -> None:
     npm = shutil.which("npm")
     if npm is None:
         pytest.skip(f"no npm on this machine to fetch {package} with")
+    words = [npm, "install", "--prefix", str(folder), *FLAGS, package]
     try:
-        fetched = subprocess.run(
-            [npm, "install", "--prefix", str(folder), *FLAGS, package], capture_output=True, timeout=60, check=False
-        )
+        fetched = subprocess.run(words, capture_output=True, timeout=60, check=False)
     except subprocess.TimeoutExpired:
         pytest.skip(f"{package} is not to be had from npm: no answer")
     if fetched.returncode:

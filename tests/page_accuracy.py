@@ -1,7 +1,6 @@
 """What a page draws against the tracer of this package: ``python tests/page_accuracy.py RUN [RUN …]``.
 
-Each run is written as a page, drawn by a headless Chromium in software at the page's own precision, and traced with the
-same rounded weights to 2·10⁻⁵. Then follows what a picture of each level costs.
+Each run is drawn by a headless Chromium and traced with the same rounded weights; then follow the costs of each level.
 """
 
 import argparse
@@ -79,9 +78,8 @@ def main():
                 print(f"{run}, {browser.execute_script('return window.mplicits.renderer.kind')}")
                 accuracy(browser, rounded_field(field, BITS), arguments.up, arguments.size)
                 told = costs(browser, arguments.size[0], range(field.num_levels))
-                names = [f"level {level}" for level in range(field.num_levels)]
-                for row in zip(names, told, strict=True):
-                    print(described(*row))
+                for level, costs_of_level in enumerate(told):
+                    print(described(f"level {level}", costs_of_level))
         finally:
             browser.quit()
 

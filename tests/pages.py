@@ -26,9 +26,8 @@ def bumpy(*, gain=0.5):
 def painted():
     """Colours in a band that holds most of the coarsest level's surface, but not all."""
     torch.manual_seed(4)
-    return TextureField(bumpy(), ColorSiren(16, 2, omega=8.0), delta=0.02, outside=(1.0, 0.0, 0.0)).requires_grad_(
-        False
-    )
+    color = ColorSiren(16, 2, omega=8.0)
+    return TextureField(bumpy(), color, delta=0.02, outside=(1.0, 0.0, 0.0)).requires_grad_(False)
 
 
 def until(condition):
@@ -61,19 +60,12 @@ def rendered(browser, camera, **wanted):
 
 
 class Differences(NamedTuple):
-    """Of a picture of a page from what the tracer of this package finds.
+    """Of a picture of a page from what the tracer of this package finds."""
 
-    Attributes:
-        hits: how many rays meet the surface, by that tracer.
-        mask: share of the pixels that do in one alone.
-        depth: ``(N,)`` of those that do in both, in units of the field.
-        angle: ``(N,)`` between normals, in degrees.
-    """
-
-    hits: int
-    mask: float
-    depth: np.ndarray
-    angle: np.ndarray
+    hits: int  # rays that meet the surface, by the tracer
+    mask: float  # share of the pixels that meet it in one alone
+    depth: np.ndarray  # (N,) where both meet it, in units of the field
+    angle: np.ndarray  # (N,) between normals, in degrees
 
 
 def differences(found, field, camera, level, *, tolerance, resolution) -> Differences:
@@ -81,9 +73,8 @@ def differences(found, field, camera, level, *, tolerance, resolution) -> Differ
     hits = sphere_trace(field, eye, directions, level=level, tolerance=tolerance, resolution=resolution)
     mask = hits.mask.numpy()
     both = (found[..., 3] > 0) & mask
-    normals = torch.nn.functional.normalize(
-        field.jet(hits.position[torch.from_numpy(both)], level=level).gradient, dim=-1
-    )
+    slopes = field.jet(hits.position[torch.from_numpy(both)], level=level).gradient
+    normals = torch.nn.functional.normalize(slopes, dim=-1)
     chord = np.linalg.norm(normals.numpy() - found[both][:, :3], axis=-1)
     return Differences(
         int(mask.sum()),

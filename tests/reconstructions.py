@@ -1,14 +1,22 @@
 """What tests of reconstructions share: scenes, starts and textures that take no time."""
 
 import inspect
+import math
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import pytest
+import torch
+from mplicits.datasets.synthetic.scenes import SCENES, render_scene
+from mplicits.datasets.views.images import PosedImage, PosedImages
+from mplicits.neural_fields import Jet, Sphere
 from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct import train as reconstruct_texture
 from mplicits.pipelines.training.settings import ReconstructConfig, TextureConfig
+from torch import Tensor, nn
 
 # Two levels that take no time, for a few steps on a few rays.
 TINY_SCENE = ReconstructConfig(
@@ -31,13 +39,40 @@ QUICK = {"learning_rate": 2e-3, "color_rate": 12.0, "sharpening": 8.0}
 
 
 def small_reconstructions(patch: pytest.MonkeyPatch) -> None:
-    """Begin by one linear solve or a short fit, and colour few points by a small network.
-
-    How good starts and textures are is tested elsewhere.
-    """
+    """Begin by one linear solve or a short fit, and colour few points by a small network."""
     patch.setattr(scene_model, "fit_sphere", solve_sphere)
     patch.setitem(inspect.unwrap(hull.start_at_hull).__kwdefaults__, "steps", 50)
     finish = reconstruct_texture.FinishOptions(texture_samples=2000, texture_resolution=32)
     patch.setattr(reconstruct_texture, "FINISH", finish)
     small = partial(TextureConfig, samples=2000, width=16, depth=1, batch=256, band_batch=256)
     patch.setattr(reconstruct_texture, "TextureConfig", small)
+
+
+def painted_sphere(views: int, size: int, samples: int = 1, **options: bool) -> PosedImages:
+    """Photographs of a sphere of radius 0.6 around the origin."""
+    return render_scene(SCENES["painted-sphere"](), views, size, samples=samples, **options)
+
+
+def with_views(images: PosedImages, change: Callable[[int, PosedImage], PosedImage]) -> PosedImages:
+    """The data set with ``change(number, view)`` in the place of each view."""
+    return replace(images, views=tuple(change(number, view) for number, view in enumerate(images.views)))
+
+
+def without(images: PosedImages, part: str) -> PosedImages:
+    """The data set without the ``mask`` or ``depth`` of each view."""
+    return with_views(images, lambda _, view: replace(view, **{part: None}))
+
+
+class Paint(nn.Module):
+    """The exact colours of the painted sphere, from anywhere."""
+
+    def forward(self, x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+        return torch.from_numpy(SCENES["painted-sphere"]().color(x.double().numpy())).float()
+
+
+def exact_model(inv_std: float = 2000.0, exposures: scene_model.Exposures | None = None) -> scene_model.SceneModel:
+    """The painted sphere as a model that has learnt it, but for its uncertainty."""
+    model = scene_model.SceneModel(Sphere(radius=0.6), Paint(), None, torch.ones(3), exposures)
+    with torch.no_grad():
+        model.variance.fill_(math.log(inv_std) / 10)
+    return model

@@ -1,8 +1,6 @@
-"""Everything that evaluates or trains, on an accelerator: the same calls on the CPU and there.
+"""Everything that evaluates or trains gives on an accelerator what it gives on the CPU.
 
-Random numbers come from generators of the host, whatever the device, and the stand-in computes with the CPU's kernels:
-there results are equal to the last bit. On CUDA itself, which rounds otherwise, this asks for finite results of the
-same shape; how good they are is asked elsewhere.
+Equal to the last bit on the stand-in; on CUDA, which rounds otherwise, finite results of the same shape.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import mplicits.neural_fields as nf
 import numpy as np
 import pytest
 import standin
@@ -17,25 +16,11 @@ import torch
 from evolutions import few_points
 from fields import small_multiscale, small_spacetime, two_levels
 from hosts import Heads, NeuSHost, ray_samples
-from mplicits.datasets import PointCloud, sample_torus, write_cloud_ply
+from mplicits.datasets import sample_torus, write_cloud_ply
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.clouds.cleaning.prepare import prepare_cloud
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_neus
-from mplicits.neural_fields import (
-    InstantNSRGeometry,
-    NerfstudioField,
-    NeuSGeometry,
-    Similarity,
-    Siren,
-    Sphere,
-    Torus,
-    WorldField,
-    extract_mesh,
-    load_field,
-    render_volume,
-    sphere_trace,
-)
 from mplicits.neural_fields.networks.colors import ViewColor
 from mplicits.neural_fields.networks.multiscale import fit_sphere, solve_sphere
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
@@ -43,10 +28,9 @@ from mplicits.neural_fields.tracing.cones import cone_ends, cone_starts
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit.unoriented import SIGNING, give_signs
-from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.training.settings import FitConfig, load_config
 from reconstructions import small_reconstructions
-from test_commands import EVOLVE, FIT, RECONSTRUCT, TEXTURE
+from test_commands import EVOLVE, FIT, RECONSTRUCT, TEXTURE, a_cloud, a_mesh
 from torch import Tensor, nn
 
 from benchmarks.cli import main as benchmarks
@@ -76,7 +60,7 @@ def same(work: Callable[[torch.device], Result], accelerator: torch.device) -> N
 
 @pytest.fixture(autouse=True)
 def _one_march(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rays march on the CPU too as they do on accelerators; test_ahead.py compares the two marches."""
+    """Rays march on the CPU as on accelerators; test_march_gpu.py compares the two marches."""
     monkeypatch.setattr("mplicits.neural_fields.tracing.sphere.makes_wait", lambda _: True)
 
 
@@ -89,16 +73,13 @@ def tensors(module: nn.Module) -> list[Tensor]:
     return [*module.state_dict().values()]
 
 
-# --- consumers of a field -----------------------------------------------------------------------------
-
-
 def traced(device: torch.device) -> Result:
     field, (origin, directions) = small_multiscale(0.3).to(device), rays(device)
     near = cone_starts(field, origin, directions, tiles=(8, 4))
     far = cone_ends(field, origin, directions, near.isfinite(), tiles=(8, 4))
-    hits = sphere_trace(field, origin, directions, near=near, far=far, max_steps=64)
-    fixed = sphere_trace(field, origin, directions, budget=(20, 5, 5))
-    graph = sphere_trace(field, origin, directions, max_steps=64, differentiable=True)
+    hits = nf.sphere_trace(field, origin, directions, near=near, far=far, max_steps=64)
+    fixed = nf.sphere_trace(field, origin, directions, budget=(20, 5, 5))
+    graph = nf.sphere_trace(field, origin, directions, max_steps=64, differentiable=True)
     graph.depth[graph.mask].sum().backward()
     return near, far, *hits, *fixed, *(parameter.grad for parameter in field.base.parameters())
 
@@ -110,8 +91,8 @@ def traced_in_time(device: torch.device) -> Result:
 
 
 def meshed(device: torch.device) -> Result:
-    mesh = extract_mesh(Sphere(radius=0.6).to(device), resolution=24)
-    fine = extract_mesh(two_levels().to(device), resolution=24)
+    mesh = nf.extract_mesh(nf.Sphere(radius=0.6).to(device), resolution=24)
+    fine = nf.extract_mesh(two_levels().to(device), resolution=24)
     return mesh.vertices, mesh.faces, mesh.normals, fine.vertices, fine.normals
 
 
@@ -121,34 +102,27 @@ def volume_rendered(device: torch.device) -> Result:
     with torch.no_grad():
         field.deltas.mul_(0.1)
     field, color = field.to(device), color.to(device)
-    origin, directions = rays(device)
-    directions = directions.reshape(-1, 3)
+    origins, directions = (part.reshape(-1, 3) for part in torch.broadcast_tensors(*rays(device)))
+    options = {
+        "inv_std": 20.0,
+        "sampling": Sampling(uniform=8, importance=8),
+        "background": torch.ones(3, device=device),
+    }
     found = []
     for generator in (None, torch.Generator().manual_seed(0)):
-        seen = render_volume(
-            field,
-            color,
-            origin.expand_as(directions),
-            directions,
-            inv_std=20.0,
-            sampling=Sampling(uniform=8, importance=8),
-            background=torch.ones(3, device=device),
-            generator=generator,
-        )
+        seen = nf.render_volume(field, color, origins, directions, generator=generator, **options)
         found += [seen.color, seen.opacity, seen.depth, seen.normal]
     (found[4].square().mean() + seen.jet.gradient.norm(dim=-1).mean()).backward()
     return *found, *(parameter.grad for parameter in field.parameters())
 
 
 def in_neus(device: torch.device) -> Result:
-    host = NeuSHost(NeuSGeometry(small_multiscale(0.5)), 2)
+    host = NeuSHost(nf.NeuSGeometry(small_multiscale(0.5)), 2)
     host.geometry.to(device)
     host.color.to(device)
     host.inverse_deviation = nn.Parameter(host.inverse_deviation.detach().to(device))
     optimiser = torch.optim.Adam(host.parameters(), lr=1e-3)
-    origin, directions = rays(device)
-    directions = directions.reshape(-1, 3)[::16]
-    origins = origin.expand_as(directions)
+    origins, directions = (part.reshape(-1, 3)[::16] for part in torch.broadcast_tensors(*rays(device)))
     depths = torch.linspace(1.8, 3.2, 8, device=device).expand(len(directions), 8)
     for _ in range(2):
         finer = host.finer_depths(origins, directions, depths)
@@ -159,7 +133,7 @@ def in_neus(device: torch.device) -> Result:
 
 
 def in_instant_nsr(device: torch.device) -> Result:
-    geometry = InstantNSRGeometry(small_multiscale(0.5), radius=1.5).to(device)
+    geometry = nf.InstantNSRGeometry(small_multiscale(0.5), radius=1.5).to(device)
     x = (torch.rand(20, 3) - 0.5).to(device)
     found = geometry(x, with_grad=True, with_feature=True)
     sum(part.square().mean() for part in found).backward()
@@ -167,7 +141,7 @@ def in_instant_nsr(device: torch.device) -> Result:
 
 
 def in_nerfstudio(device: torch.device) -> Result:
-    host = NerfstudioField(small_multiscale(0.5), ViewColor(2, width=16, depth=1), heads=Heads).to(device)
+    host = nf.NerfstudioField(small_multiscale(0.5), ViewColor(2, width=16, depth=1), heads=Heads).to(device)
     samples = ray_samples(torch.linspace(0.2, 1.8, 8).expand(6, 8))
     for name in ("origins", "directions", "starts"):
         setattr(samples.frustums, name, getattr(samples.frustums, name).to(device))
@@ -179,7 +153,7 @@ def in_nerfstudio(device: torch.device) -> Result:
 
 def in_input_units(device: torch.device) -> Result:
     """Arrays in, arrays out, wherever the field is."""
-    world = WorldField(small_multiscale(0.3).to(device), Similarity((5.0, 0.0, -1.0), 20.0))
+    world = nf.WorldField(small_multiscale(0.3).to(device), nf.Similarity((5.0, 0.0, -1.0), 20.0))
     points = np.random.default_rng(0).uniform(-20, 20, (40, 3))
     hits = world.trace(points, -points)
     closest = world.closest(points)
@@ -187,22 +161,15 @@ def in_input_units(device: torch.device) -> Result:
 
 
 def begun_as_spheres(device: torch.device) -> Result:
-    solved, trained = Siren(32, 2, omega=10.0).to(device), Siren(32, 2, omega=10.0).to(device)
+    solved, trained = nf.Siren(32, 2, omega=10.0).to(device), nf.Siren(32, 2, omega=10.0).to(device)
     solve_sphere(solved)
     fit_sphere(trained, steps=3, batch=64)
     return *tensors(solved), *tensors(trained)
 
 
 CONSUMERS = (
-    traced,
-    traced_in_time,
-    meshed,
-    volume_rendered,
-    in_neus,
-    in_instant_nsr,
-    in_nerfstudio,
-    in_input_units,
-    begun_as_spheres,
+    *(traced, traced_in_time, meshed, volume_rendered, begun_as_spheres),
+    *(in_neus, in_instant_nsr, in_nerfstudio, in_input_units),
 )
 
 
@@ -211,14 +178,10 @@ def test_what_uses_a_field(work: Callable[[torch.device], Result], accelerator: 
     same(work, accelerator)
 
 
-# --- trainings ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("recipe", [SirenRecipe(), BaconRecipe(), IdfRecipe(), InstantNgpRecipe("fine"), BanfRecipe()])
 def test_methods_of_the_peers(recipe: object, accelerator: torch.device) -> None:
     cloud = prepare_cloud(sample_torus(300))
-    presets = NGP_PRESETS if isinstance(recipe, InstantNgpRecipe) else recipe.presets
-    settings = presets["fine", "smoke"] if isinstance(recipe, InstantNgpRecipe) else presets["smoke"]
+    settings = NGP_PRESETS["fine", "smoke"] if isinstance(recipe, InstantNgpRecipe) else recipe.presets["smoke"]
     steps = (4,) * len(settings.steps) if isinstance(settings.steps, tuple) else 4
     settings = replace(settings, steps=steps)
 
@@ -238,7 +201,6 @@ def test_signs_of_normals(accelerator: torch.device, monkeypatch: pytest.MonkeyP
 
     def work(device: torch.device) -> Result:
         signs = give_signs(points, normals, config, device=device)
-        assert signs is not None
         return signs.turned, np.array(signs.slope)
 
     same(work, accelerator)
@@ -273,15 +235,13 @@ def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest
         folder.mkdir()
         monkeypatch.chdir(folder)
         write_cloud_ply(Path("scan.ply"), cloud)
-        write_cloud_ply(
-            Path("coloured.ply"), PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype(np.float32))
-        )
-        write_mesh(Path("mesh.ply"), extract_mesh(Torus(major=0.5, minor=0.2), resolution=16), Similarity.identity())
+        a_cloud(Path("coloured.ply"))
+        a_mesh(Path("mesh.ply"))
         write_neus(Path("photos"), scene)
         for command in COMMANDS:
             run = benchmarks if command.startswith("normal-map") else main
             assert run([*command.split(), "--device", str(device)]) == 0, command
-        found = [tensor for name in FIELDS for tensor in tensors(load_field(f"{name}/field.safetensors").field)]
+        found = [tensor for name in FIELDS for tensor in tensors(nf.load_field(f"{name}/field.safetensors").field)]
         return [*found, *(cv2.imread(name, cv2.IMREAD_UNCHANGED) for name in PICTURES)]
 
     same(work, accelerator)
@@ -289,4 +249,4 @@ def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest
 
 def test_a_device_that_is_not_there_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
     assert benchmarks(["normals", "--device", "warp"]) == 2
-    assert "--device warp: not usable here" in capsys.readouterr().err
+    assert "--device warp" in capsys.readouterr().err

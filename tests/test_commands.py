@@ -1,9 +1,6 @@
 """Every command that a reader may copy runs: in the order of its page, in an empty folder, at the smallest setting.
 
-The rule: a page's shell blocks are gone through line by line. What a line reads and no line before it has made is put
-there by a stand-in of that name (`STAND_INS`). What `SMALLEST` has for it is appended to the line, where the last of
-two flags counts, and `SMALLER` replaces the values of flags that not every line may have. A line that cannot run
-here is skipped, visibly, with its reason.
+Files that a line reads are made by `STAND_INS`; `SMALLEST` adds flags to a line, `SMALLER` replaces values of flags.
 """
 
 import dataclasses
@@ -86,14 +83,12 @@ WRITTEN = ("-o", "--out", "--mesh", "--json", "--page")
 
 
 def shell_lines(page: Path) -> list[str]:
-    """The lines of a page's shell blocks, without their comments."""
     blocks = re.findall(r"^```sh\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     lines = (line.partition("  #")[0].strip() for block in blocks for line in block.splitlines())
     return [line for line in lines if line]
 
 
 def smallest(line: str) -> list[str]:
-    """The arguments of a line, at the smallest setting."""
     words = shlex.split(line.removeprefix("python -m "))
     small = [SMALLER.get(before, word) for before, word in zip(["", *words[:-1]], words, strict=True)]
     return [*small[1:], *(flag for begin, flags in SMALLEST.items() if fnmatch(line, begin) for flag in flags.split())]
@@ -105,9 +100,6 @@ def read_by(line: str) -> list[str]:
     return [word.rstrip("/") for before, word in pairwise(words) if before not in WRITTEN and not word.startswith("-")]
 
 
-# --- stand-ins: each makes what its name says, as small as it may be -----------------------------------
-
-
 def a_cloud(path: Path) -> None:
     cloud = sample_torus(400)
     write_cloud_ply(path, PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype(np.float32)))
@@ -115,16 +107,11 @@ def a_cloud(path: Path) -> None:
 
 def arrays(path: Path) -> None:
     cloud = sample_torus(400)
-    assert cloud.normals is not None
     np.savez(path, points=cloud.points, normals=cloud.normals)
 
 
 def a_mesh(path: Path) -> None:
     write_mesh(path, extract_mesh(Torus(major=0.5, minor=0.2), resolution=24), Similarity.identity())
-
-
-def meshes(path: Path) -> None:
-    a_mesh(path / "torus.ply")
 
 
 def views(path: Path, *, form: str = "transforms", count: int = 4) -> None:
@@ -138,15 +125,13 @@ def cameras(path: Path) -> None:
 
 
 def scans_with_truth(path: Path) -> None:
+    cloud = sample_torus(400)
     for folder in ("scans", "ground_truth"):
         (path / folder).mkdir(parents=True)
-        cloud = sample_torus(400)
-        assert cloud.normals is not None
         np.save(path / folder / "anchor.npy", np.concatenate((cloud.points, cloud.normals), axis=1))
 
 
 def a_run(path: Path) -> None:
-    """A fit with colours."""
     a_cloud(path.parent / "fitted.ply")
     quietly("fit", path.parent / "fitted.ply", "-o", path, *FIT.split(), "--quiet")
     quietly("texture", path, path.parent / "fitted.ply", *TEXTURE.split(), "--quiet")
@@ -180,16 +165,12 @@ def depth_maps(path: Path) -> None:
 
 
 STAND_INS: dict[str, Callable[[Path], None]] = {
-    "*scan.ply": a_cloud,
-    "scans/*.ply": a_cloud,
-    "ten_million.ply": a_cloud,
+    **dict.fromkeys(("*scan.ply", "scans/*.ply", "ten_million.ply"), a_cloud),
     "*.ply": a_mesh,
     "*.npz": arrays,
-    "meshes": meshes,
-    "runs/morph": a_motion,
-    "runs/turn": a_motion,
-    "runs/*": a_run,
-    "demo/run": a_run,
+    "meshes": lambda path: a_mesh(path / "torus.ply"),
+    **dict.fromkeys(("runs/morph", "runs/turn"), a_motion),
+    **dict.fromkeys(("runs/*", "demo/run"), a_run),
     "photos": functools.partial(views, count=12),  # three of which are apart by so much that no two share a place
     "srb": scans_with_truth,
     "lego": views,
@@ -205,31 +186,26 @@ def quietly(*words: object) -> None:
     assert main([str(word) for word in words]) == 0
 
 
-class Maker:
-    """Puts stand-ins where they are asked for; those that take a training are made once."""
+@pytest.fixture(scope="module")
+def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], None]:
+    """Make what a line reads under a name, unless it is there; what takes a training is made once and copied."""
+    store = tmp_path_factory.mktemp("store")
 
-    def __init__(self, store: Path) -> None:
-        self.store = store
-
-    def __call__(self, name: str) -> None:
-        """Make what a line reads under this name, if it is one of ours and not there."""
-        make = next((make for pattern, make in STAND_INS.items() if fnmatch(name, pattern)), None)
+    def put(name: str) -> None:
         path = Path(name)
+        make = next((make for pattern, make in STAND_INS.items() if fnmatch(name, pattern)), None)
         if make is None or path.exists():
             return
         path.parent.mkdir(parents=True, exist_ok=True)
-        if make in (a_run, a_motion):
-            kept = self.store / make.__name__
-            if not kept.exists():
-                make(kept)
-            shutil.copytree(kept, path)
-        else:
+        if make not in (a_run, a_motion):
             make(path)
+            return
+        kept = store / make.__name__
+        if not kept.exists():
+            make(kept)
+        shutil.copytree(kept, path)
 
-
-@pytest.fixture(scope="module")
-def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Maker:
-    return Maker(tmp_path_factory.mktemp("store"))
+    return put
 
 
 @pytest.fixture(autouse=True)
@@ -258,23 +234,18 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def reason_to_skip(line: str) -> str | None:
-    """Why a line cannot run here, if it cannot."""
     words = shlex.split(line)
     elsewhere = {  # run by tests of their own, where there is what they need
         "pip": "installs from the network",
-        "ns-train": "tests/pipelines/nerfstudio runs it, where nerfstudio is installed",
-        "ns-mplicits-export": "tests/pipelines/nerfstudio runs it, where nerfstudio is installed",
+        **dict.fromkeys(("ns-train", "ns-mplicits-export"), "tests/pipelines/nerfstudio runs it"),
         "python tests/hosts/run.py": "needs a clone of the host",
     }
     for begin, reason in elsewhere.items():
         if line.startswith(f"{begin} "):
             return reason
     if line.startswith(("mplicits find-cameras ", "mplicits find-points ")) or "--poses colmap" in line:
-        return (
-            "COLMAP finds nothing in pictures so small; tests/datasets/views/poses/test_find_cameras.py has larger ones"
-        )
-    needs = {"poisson": "pymeshlab", "--texture": "xatlas"}
-    for word, module in needs.items():
+        return "COLMAP finds nothing in pictures so small; test_find_cameras.py has larger ones"
+    for word, module in {"poisson": "pymeshlab", "--texture": "xatlas"}.items():
         if word in words and find_spec(module) is None:
             return f"{module} is not installed"
     return None
@@ -296,10 +267,7 @@ LONG = ("animate", "evolve")  # pages whose lines train the most; the tour has t
 
 LINES = [
     pytest.param(
-        page,
-        benches,
-        id=f"{page.stem}{'-bench' if benches else ''}",
-        marks=[pytest.mark.slow] if benches or page.stem in LONG else [],
+        page, benches, id=page.stem + "-bench" * benches, marks=[pytest.mark.slow] * (benches or page.stem in LONG)
     )
     for page in PAGES
     for benches in (False, True)
@@ -308,15 +276,7 @@ LINES = [
 
 
 @pytest.mark.parametrize(("page", "benches"), LINES)
-def test_commands_of_a_page_run(
-    page: Path,
-    benches: bool,
-    stand_in: Maker,
-    subtests: pytest.Subtests,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_commands_of_a_page_run(page, benches, stand_in, subtests, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     Path("few.yaml").write_text(FEW, encoding="utf-8")
     for name, content in files_of(page):
@@ -336,11 +296,8 @@ def test_commands_of_a_page_run(
 
 
 def test_no_command_hides_in_a_block_of_another_kind() -> None:
+    blocks = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
     for page in PAGES:
-        for language, block in re.findall(
-            r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-        ):
-            if language != "sh":
-                assert not re.search(r"^(mplicits|python -m benchmarks) ", block, re.MULTILINE), (
-                    f"{page.name}: call this block sh:\n{block}"
-                )
+        for language, block in blocks.findall(page.read_text(encoding="utf-8")):
+            command = re.search(r"^(mplicits|python -m benchmarks) ", block, re.MULTILINE)
+            assert language == "sh" or not command, f"{page.name}: call this block sh:\n{block}"

@@ -29,13 +29,8 @@ MODULES = [
 
 
 def blocks(language: str) -> list[str]:
-    return [
-        block
-        for path in DOCUMENTS
-        for block in re.findall(
-            rf"^```{language}\n(.*?)^```", path.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-        )
-    ]
+    block = re.compile(rf"^```{language}\n(.*?)^```", re.MULTILINE | re.DOTALL)
+    return [found for path in DOCUMENTS for found in block.findall(path.read_text(encoding="utf-8"))]
 
 
 def commands() -> list[str]:
@@ -49,20 +44,17 @@ def test_docstring_examples(name: str) -> None:
     assert doctest.testmod(importlib.import_module(name)).failed == 0
 
 
-def test_there_are_docstring_examples() -> None:
+def test_there_are_examples() -> None:
     finder = doctest.DocTestFinder()
     found = [test for name in MODULES for test in finder.find(importlib.import_module(name)) if test.examples]
     assert len(found) > 5
+    assert len(blocks("python")) >= 2
+    assert len(commands()) >= 5
 
 
 @pytest.mark.parametrize("block", blocks("python"))
 def test_python_of_the_documents(block: str) -> None:
     exec(compile(block, "README.md", "exec"), {})
-
-
-def test_the_documents_have_python_and_commands() -> None:
-    assert len(blocks("python")) >= 2
-    assert len(commands()) >= 5
 
 
 @pytest.mark.parametrize("line", commands())

@@ -19,10 +19,8 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "cloud.ply": lambda path: write_cloud_ply(path, PointCloud(np.ones((5, 3)))),
     "figures.json": lambda path: write_json(path, {"one": 1}),
     "field.safetensors": lambda path: save_field(path, Siren(8, 1)),
-    "mesh.glb": lambda path: write_mesh(path, extract_mesh(Sphere(radius=0.5), resolution=8)),
-    "mesh.obj": lambda path: write_mesh(path, extract_mesh(Sphere(radius=0.5), resolution=8)),
-    "picture.jpg": lambda path: write_picture(path, np.zeros((9, 8, 3), np.uint8)),
-    "picture.png": lambda path: write_picture(path, np.zeros((9, 8, 3), np.uint8)),
+    **dict.fromkeys(("mesh.glb", "mesh.obj"), lambda path: write_mesh(path, extract_mesh(Sphere(), resolution=8))),
+    **dict.fromkeys(("picture.jpg", "picture.png"), lambda path: write_picture(path, np.zeros((9, 8, 3), np.uint8))),
     "state.safetensors": lambda path: save_state(path, {}, {"step": 1}),
     "text.txt": lambda path: write_whole(path, "text\r\n"),
 }
@@ -46,15 +44,16 @@ def test_missing_folders_are_made(tmp_path: Path, name: str) -> None:
     assert list(tmp_path.iterdir()) == []  # asking makes nothing
     WRITERS[name](path)
     assert list(path.parent.iterdir()) == [path]
+    assert path.stat().st_size > 0
 
 
 def test_a_file_is_no_folder_to_write_in(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     (tmp_path / "lost").symlink_to(tmp_path / "nowhere")
     for above in ("file", "lost"):
-        with pytest.raises(InputError, match=rf"a\.txt: .*{above} is no folder; choose another place"):
+        with pytest.raises(InputError, match=rf"a\.txt: .*{above} is no folder"):
             check_place(tmp_path / above / "deeper" / "a.txt")
-        with pytest.raises(InputError, match=r"a\.txt: cannot be written \(.*\); choose another place"):
+        with pytest.raises(InputError, match=r"a\.txt: cannot be written"):
             write_whole(tmp_path / above / "a.txt", "text")
     assert (tmp_path / "file").read_text() == "mine"
 
@@ -86,14 +85,6 @@ def test_an_interruption_leaves_the_older_file_and_nothing_else(tmp_path: Path, 
 def test_line_ends_stay_as_they_are(tmp_path: Path) -> None:
     write_whole(tmp_path / "a.txt", "é\r\n\n")
     assert (tmp_path / "a.txt").read_bytes() == b"\xc3\xa9\r\n\n"
-
-
-@pytest.mark.parametrize("name", WRITERS)
-def test_everything_is_written_that_way(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    WRITERS[name](path)
-    assert list(tmp_path.iterdir()) == [path]
-    assert path.stat().st_size > 0
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this machine")

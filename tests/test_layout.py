@@ -1,7 +1,4 @@
-"""The house: which room may import which, how light the lowest is, and that the wheel holds them all.
-
-Files import from rooms below their own, or from their own, and no two files import each other.
-"""
+"""Which room may import which, how light the lowest is, and that the wheel holds them all."""
 
 import ast
 import importlib
@@ -25,58 +22,29 @@ from mplicits.neural_fields.backend.devices import environment
 
 ROOT = Path(__file__).parent.parent
 # From the ground up. A room imports from those above it in this list, never from those below.
+FIELDS = ("backend", "fields", "networks", "volume", "tracing", "meshing", "spacetime")
+PIPELINES = ("training", "surface", "fit", "texture", "mesh", "render", "web", "evolve", "reconstruct", "cli", "front")
 ROOMS = (
-    "neural_fields/backend",
-    "neural_fields/fields",
-    "neural_fields/networks",
-    "neural_fields/volume",
-    "neural_fields/tracing",
-    "neural_fields/meshing",
-    "neural_fields/spacetime",
-    "neural_fields",
-    "neural_fields/hosts",
-    "datasets",
-    "pipelines/training",
-    "pipelines/surface",
-    "pipelines/fit",
-    "pipelines/texture",
-    "pipelines/mesh",
-    "pipelines/render",
-    "pipelines/web",
-    "pipelines/evolve",
-    "pipelines/reconstruct",
-    "pipelines/cli",
-    "pipelines/nerfstudio",
-    "pipelines/front",
+    *(f"neural_fields/{name}" for name in FIELDS),
+    *("neural_fields", "neural_fields/hosts", "datasets"),
+    *(f"pipelines/{name}" for name in (*PIPELINES, "nerfstudio")),
 )
 FRONT = "pipelines/front"
 FACE = ROOT / "neural_fields" / "__init__.py"  # which offers the names of all folders beside it
-PLUGIN = "pipelines/nerfstudio"  # for whom nerfstudio is installed, and who imports it, not we
+PLUGIN = "pipelines/nerfstudio"  # whose imports need nerfstudio
 OUTSIDE = {"torch", "numpy", "safetensors"}  # what neural_fields may import
 LATE = {"torchdiffeq", "trimesh"}  # and what only inside a function that needs it
 # Where Triton may be imported; the files that do are imported late themselves.
 KERNELS = ("neural_fields/backend/kernels", "neural_fields/tracing/picture.py")
-LIGHT = "import {}, sys; assert not {{'torch', 'numpy', 'scipy'}} & set(sys.modules), sorted(sys.modules)"
-
 
 # The same for benchmarks, which may import from any room above, by its installed name.
-BENCHMARKS = (
-    "benchmarks/harness",
-    "benchmarks/peers",
-    "benchmarks/shapes",
-    "benchmarks/costs",
-    "benchmarks/scenes",
-    "benchmarks/motion",
-    "benchmarks/paper",
-    "benchmarks/cli",
-)
+MEASURING = ("harness", "peers", "shapes", "costs", "scenes", "motion", "paper", "cli")
+BENCHMARKS = tuple(f"benchmarks/{name}" for name in MEASURING)
 
 
 def sources() -> list[Path]:
-    """The files of the wheel."""
-    return sorted(
-        path for package in ("neural_fields", "datasets", "pipelines") for path in (ROOT / package).rglob("*.py")
-    )
+    packages = ("neural_fields", "datasets", "pipelines")
+    return sorted(path for package in packages for path in (ROOT / package).rglob("*.py"))
 
 
 def benchmarks() -> list[Path]:
@@ -101,7 +69,6 @@ def imports(path: Path, *, nested: bool = True) -> list[tuple[int, str, list[str
 
 
 def imported(path: Path) -> list[Path]:
-    """The files of this project that a file imports from."""
     found = []
     for level, module, names in imports(path):
         if level == 0:
@@ -113,13 +80,8 @@ def imported(path: Path) -> list[Path]:
         assert folder != ROOT.parent, f"{path}: import leads out of mplicits"
         target = folder.joinpath(*module.split(".")) if module else folder
         for name in names:  # a name is a file of a folder, or stands in the file or in the folder's face
-            choices = (
-                target / f"{name}.py",
-                target / name / "__init__.py",
-                target.with_suffix(".py"),
-                target / "__init__.py",
-            )
-            found.append(next(choice for choice in choices if choice.is_file()))
+            choices = [target / f"{name}.py", target / name / "__init__.py", target.with_suffix(".py")]
+            found.append(next(choice for choice in [*choices, target / "__init__.py"] if choice.is_file()))
     return found
 
 
@@ -134,42 +96,22 @@ def test_every_file_has_a_room() -> None:
     assert not lost, f"no room in the order: {sorted(lost)}"
 
 
-@pytest.mark.parametrize("name", ROOMS)
+@pytest.mark.parametrize("name", [*ROOMS, *BENCHMARKS])
 def test_rooms_import_from_rooms_before_them(name: str) -> None:
-    files = [path for path in sources() if room(path) == name]
+    """Benchmarks import the library as ``mplicits``, and nothing imports benchmarks."""
+    order = ROOMS if name in ROOMS else ("benchmarks", *BENCHMARKS)
+    allowed = order[: order.index(name) + 1]
+    files = [path for path in [*sources(), *benchmarks()] if room(path) == name]
     assert files
-    allowed = set(ROOMS[: ROOMS.index(name) + 1])
     for path in files:
+        assert not any(module.split(".")[0] == "benchmarks" for level, module, _ in imports(path) if level == 0)
         for other in imported(path):
             if path != FACE:
                 assert room(other) in allowed, f"{path.relative_to(ROOT)} imports {other.relative_to(ROOT)}"
 
 
-@pytest.mark.parametrize("name", BENCHMARKS)
-def test_benchmarks_import_from_benchmarks_before_them(name: str) -> None:
-    """Relative imports stay inside; the library is imported as ``mplicits``."""
-    files = [path for path in benchmarks() if room(path) == name]
-    assert files
-    allowed = {"benchmarks", *BENCHMARKS[: BENCHMARKS.index(name) + 1]}
-    for path in files:
-        assert not {module.split(".")[0] for level, module, _ in imports(path) if level == 0} & {"benchmarks"}
-        for other in imported(path):
-            assert room(other) in allowed, f"{path.relative_to(ROOT)} imports {other.relative_to(ROOT)}"
-
-
-def test_the_package_does_not_know_its_benchmarks() -> None:
-    for path in sources():
-        assert not any(module.split(".")[0] == "benchmarks" for _, module, _ in imports(path)), path
-        assert not any(other.is_relative_to(ROOT / "benchmarks") for other in imported(path)), path
-
-
-def test_nobody_imports_the_plugin() -> None:
-    for path in sources():
-        assert room(path) == PLUGIN or PLUGIN not in map(room, imported(path)), path
-
-
 def test_no_two_files_import_each_other() -> None:
-    """Not even by way of others, nor late; a folder's face, which imports its files, may be asked by others only."""
+    """Not even by way of others, nor late; files do not import the face of their own folder."""
     files = [*sources(), *benchmarks()]
     graph = {path: {other for other in imported(path) if other != path} for path in files}
     for path, others in graph.items():
@@ -178,7 +120,6 @@ def test_no_two_files_import_each_other() -> None:
 
 
 def test_one_file_goes_up_by_name() -> None:
-    """The tests above do not see imports written as words: only the front door has them, and one file below it."""
     named = {path.relative_to(ROOT).as_posix() for path in sources() if "import_module(" in path.read_text("utf-8")}
     # The face of neural_fields names files beside it, for names of earlier releases.
     assert named == {"neural_fields/upward.py", "neural_fields/__init__.py", f"{FRONT}/__init__.py"}
@@ -191,47 +132,44 @@ def test_neural_fields_is_light() -> None:
         for level, module, _ in imports(path):
             top = module.split(".")[0]
             if level == 0:
-                known = (
-                    OUTSIDE | LATE | ({"triton"} if path.relative_to(ROOT).as_posix().startswith(KERNELS) else set())
-                )
-                assert top in known or top in sys.stdlib_module_names, f"{path} imports {top}"
-        assert not LATE & {module for _, module, _ in imports(path, nested=False)}, (
-            f"{path} imports one of {LATE} too early"
-        )
+                triton = {"triton"} if path.relative_to(ROOT).as_posix().startswith(KERNELS) else set()
+                assert top in OUTSIDE | LATE | triton | sys.stdlib_module_names, f"{path} imports {top}"
+        early = LATE & {module for _, module, _ in imports(path, nested=False)}
+        assert not early, f"{path} imports {early} too early"
 
 
-@pytest.mark.parametrize("module", ["mplicits", "mplicits.pipelines.cli", "mplicits.pipelines.training.settings"])
-def test_help_and_settings_do_not_load_torch(module: str) -> None:
-    subprocess.run([sys.executable, "-c", LIGHT.format(module)], check=True, cwd="/")
+LIGHT = "import {}, sys; assert not {{'torch', 'numpy', 'scipy'}} & set(sys.modules), sorted(sys.modules)"
+FRESH = {
+    "light": LIGHT.format("mplicits"),
+    "light-help": LIGHT.format("mplicits.pipelines.cli"),
+    "light-settings": LIGHT.format("mplicits.pipelines.training.settings"),
+    # A user's own `datasets` folder, or Hugging Face's package, must never be shadowed.
+    "no-top-level-name": "import mplicits.datasets, sys\n"
+    "assert not {'datasets', 'pipelines', 'neural_fields'} & set(sys.modules)",
+    "front-door": "import mplicits, sys\n"
+    "assert mplicits.__version__ and not {'torch', 'numpy'} & set(sys.modules)\n"
+    "assert all(getattr(mplicits, name) is not None and name in dir(mplicits) for name in mplicits.__all__)\n"
+    "assert set(mplicits.HOMES) < set(mplicits.__all__)\n"
+    "import mplicits.neural_fields, mplicits.pipelines.fit\n"
+    "assert mplicits.Field is mplicits.neural_fields.Field and mplicits.fit is mplicits.pipelines.fit.fit",
+}
 
 
-def test_no_top_level_name_is_taken() -> None:
-    """A user's own `datasets` folder, or Hugging Face's package, must never be shadowed."""
-    code = "import mplicits.datasets, sys; assert not {'datasets', 'pipelines', 'neural_fields'} & set(sys.modules)"
+@pytest.mark.parametrize("code", FRESH.values(), ids=FRESH)
+def test_imports_in_a_fresh_process(code: str) -> None:
     subprocess.run([sys.executable, "-c", code], check=True, cwd="/")
 
 
 def test_every_folder_with_python_in_it_is_packaged() -> None:
-    """An editable install hides a folder that was forgotten; a wheel lacks it."""
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
     folders = {path.parent.relative_to(ROOT).as_posix() for path in sources()} | {"configs"}
-    assert {package: setuptools["package-dir"][package] for package in setuptools["packages"]} == {
-        package_of(folder): folder for folder in folders
-    }
+    packaged = {package: setuptools["package-dir"][package] for package in setuptools["packages"]}
+    assert packaged == {package_of(folder): folder for folder in folders}
     for path in sources():
         assert (path.parent / "__init__.py").is_file(), f"{path.parent} has no __init__.py"
 
 
-def test_the_wheel_holds_no_benchmarks() -> None:
-    setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
-    words = {word for package in setuptools["packages"] for word in package.split(".")}
-    assert not words & {"bench", "benchmarks", "paper", "baselines", "peers"}
-    assert all(package.split(".")[0] == "mplicits" for package in setuptools["packages"])
-    assert not any(folder.startswith("benchmarks") for folder in setuptools["package-dir"].values())
-
-
 def plain(name: str) -> str:
-    """A distribution's name as indexes compare it."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
@@ -259,28 +197,24 @@ def test_dependencies_are_those_that_are_imported() -> None:
     assert recorded <= needed, f"the record of a run asks for versions of {sorted(recorded - needed)}"
 
 
-@pytest.fixture
-def make() -> str:
-    found = shutil.which("make")
-    if found is None:
-        pytest.skip("there is no make")
-    return found
+needs_make = pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")
 
 
-def test_the_demo_installs_nothing_but_the_package(make: str) -> None:
+@needs_make
+def test_the_demo_installs_nothing_but_the_package() -> None:
     for target, expected in (("demo", ["-e ."]), ("lint", ["-e .", "-e '.[dev]'"])):
-        words = [make, "-n", target, "VENV=none"]
+        words = ["make", "-n", target, "VENV=none"]
         lines = subprocess.run(words, check=True, cwd=ROOT, capture_output=True, text=True).stdout.splitlines()
         installed = [line for line in lines if " pip install " in line]
         assert [line[line.index("-e ") :] for line in installed] == expected
         assert all(" -c constraints.txt " in line for line in installed)
 
 
-def test_make_keeps_what_python_compiles(make: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is compiled at the installation: where nobody kept it, each process would compile PyTorch anew."""
+@needs_make
+def test_make_keeps_what_python_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     rule = f"kept:\n\t@'{sys.executable}' -c 'import sys; print(sys.dont_write_bytecode)'\n"
-    words = [make, "--no-print-directory", "-f", "Makefile", "-f", "-", "kept"]  # whoever runs the tests may be make
+    words = ["make", "--no-print-directory", "-f", "Makefile", "-f", "-", "kept"]  # whoever runs the tests may be make
     done = subprocess.run(words, check=True, cwd=ROOT, capture_output=True, text=True, input=rule)
     assert done.stdout == "False\n"
 
@@ -312,38 +246,20 @@ def test_the_wheel_alone_holds_every_module(tmp_path: Path) -> None:
         "for name in sys.argv[1:]:\n"
         "    file = pathlib.Path(importlib.import_module(name).__file__)\n"
         "    assert 'venv' in file.parts, file\n"
-        "print('all of them')"
     )
-    assert run(python, "-c", code, *wanted) == "all of them\n"
-
-
-def test_the_front_door() -> None:
-    """Every name is there, is what its home has, and costs nothing before it is asked for."""
-    code = (
-        "import sys, mplicits\n"
-        "assert mplicits.__version__ and not {'torch', 'numpy'} & set(sys.modules)\n"
-        "assert all(getattr(mplicits, name) is not None and name in dir(mplicits) for name in mplicits.__all__)\n"
-        "assert set(mplicits.HOMES) < set(mplicits.__all__)\n"
-        "import mplicits.neural_fields, mplicits.pipelines.fit\n"
-        "assert mplicits.Field is mplicits.neural_fields.Field and mplicits.fit is mplicits.pipelines.fit.fit\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, cwd="/")
+    assert wanted
+    run(python, "-c", code, *wanted)
 
 
 def test_names_of_earlier_releases() -> None:
-    """They work for one release, with a warning that says where they are now."""
     for module, names in neural_fields._MOVED.items():
         for name, _, new in (pair.partition("=") for pair in names.split()):
             home = f"mplicits.neural_fields.{module}"
             with pytest.warns(DeprecationWarning, match=home):
                 assert getattr(neural_fields, name) is getattr(importlib.import_module(home), new or name)
-    with pytest.raises(AttributeError, match="no attribute 'feild'"):
-        neural_fields.feild  # noqa: B018
-
-
-def test_a_name_that_is_not_there() -> None:
-    with pytest.raises(AttributeError, match="module 'mplicits' has no attribute 'feild'"):
-        mplicits.feild  # noqa: B018
+    for module in (neural_fields, mplicits):
+        with pytest.raises(AttributeError, match="no attribute 'feild'"):
+            module.feild  # noqa: B018
 
 
 def test_a_run_through_the_front_door(tmp_path: Path) -> None:
@@ -353,7 +269,7 @@ def test_a_run_through_the_front_door(tmp_path: Path) -> None:
     points = np.random.default_rng(0).uniform(-20, 20, (10, 3))
     assert (again.distance(points) == ball.distance(points)).all()
     assert again.similarity == ball.similarity
-    with pytest.raises(mplicits.InputError, match="no such run directory or file"):
+    with pytest.raises(mplicits.InputError, match="other"):
         mplicits.load(tmp_path / "other")
 
 

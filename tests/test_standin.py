@@ -8,9 +8,8 @@ import pytest
 import standin
 import torch
 from fields import small_multiscale
-from mplicits.neural_fields import Siren, Sphere, Torus, sphere_trace
+from mplicits.neural_fields import Sphere
 from torch import Tensor
-from waits import some_rays
 
 DEVICE = torch.device(standin.NAME)
 
@@ -23,12 +22,10 @@ def test_numbers_go_there_and_come_back() -> None:
     x = torch.rand(4, 3)
     there = x.to(DEVICE)
     assert isinstance(there, standin.StandInTensor)
-    assert there.device == torch.device(standin.NAME, 0)
-    assert not there.is_cpu
+    assert (there.device, there.is_cpu) == (torch.device(standin.NAME, 0), False)
     assert type(there.cpu()) is Tensor
     assert there.cpu().equal(x)
-    assert there.tolist() == x.tolist()
-    assert there[1, 2].item() == x[1, 2].item()
+    assert (there.tolist(), there[1, 2].item()) == (x.tolist(), x[1, 2].item())
 
 
 def test_shells_share_what_their_views_share() -> None:
@@ -65,7 +62,6 @@ def test_operands_on_two_devices_are_refused(mixed: object) -> None:
 
 
 def test_numbers_of_the_host_are_taken() -> None:
-    """As CUDA does: they travel with the call."""
     x, two = on_device(3), torch.tensor(2.0)
     for result in (x * two, two * x, torch.where(x > 2, two, x), torch.maximum(x, two), x.masked_fill(x < 2, two)):
         assert result.device.type == standin.NAME
@@ -92,20 +88,16 @@ def test_generators_of_the_host_are_refused() -> None:
 
 def test_memory_that_may_not_be_there_yet_is_refused() -> None:
     x = on_device(3)
-    with pytest.raises(RuntimeError, match="may be read before"):
-        x.to("cpu", non_blocking=True)
-    with pytest.raises(RuntimeError, match="may be read before"):
-        torch.empty(3).copy_(x, non_blocking=True)
-    with pytest.raises(RuntimeError, match="only dense CPU tensors can be pinned"):
-        x.pin_memory()
+    copies = (lambda: x.to("cpu", non_blocking=True), lambda: torch.empty(3).copy_(x, non_blocking=True))
+    for attempt in (*copies, x.pin_memory):
+        with pytest.raises(RuntimeError, match=r"may be read before|only dense CPU tensors can be pinned"):
+            attempt()
 
 
 @pytest.mark.parametrize(
     ("why", "times", "ask"),
     [
         ("item", 1, lambda x: x[0].item()),
-        ("item", 1, lambda x: float(x.sum())),
-        ("item", 1, lambda x: bool((x > 0).all())),
         ("item", 1, lambda x: torch.equal(x, x)),
         ("item", 3, lambda x: [float(value) for value in x]),
         ("size", 1, lambda x: x.nonzero()),
@@ -116,7 +108,6 @@ def test_memory_that_may_not_be_there_yet_is_refused() -> None:
         ("size", 1, lambda x: x.repeat_interleave(x.long())),
         ("size", 1, lambda x: x.clone().__setitem__(x > 0, x)),
         ("download", 1, lambda x: x.cpu()),
-        ("download", 1, lambda x: x.tolist()),
         ("download", 1, lambda x: torch.zeros(3).copy_(x)),
         ("upload", 1, lambda x: torch.tensor([1.0, 2.0], device=x.device)),
         ("upload", 1, lambda x: torch.ones(3).to(x)),
@@ -149,7 +140,6 @@ def test_launches_are_counted_and_views_are_none() -> None:
         torch.empty(3, device=DEVICE)
         torch.zeros(3, device=DEVICE).add_(1)
     assert book.launches == {"sin": 1, "add": 1, "sum": 1, "zero_": 1, "add_": 1}
-    assert book.kernels == 5
     with standin.counted() as outer:
         x.sin()
         with standin.counted() as inner:
@@ -166,23 +156,9 @@ def test_waits_name_the_line_that_asked() -> None:
     with standin.counted() as book:
         field.value(x)
     # Each residual is evaluated at the rows of its band, whose number the host has to know.
-    assert [(why, where.split(":")[0]) for why, where in book.waits] == [
-        ("size", "neural_fields/networks/multiscale.py")
-    ]
+    (wait,) = [(why, where.split(":")[0]) for why, where in book.waits]
+    assert wait == ("size", "neural_fields/networks/multiscale.py")
     assert book.synchronisations == field.num_levels - 1
-
-
-def test_counts_are_the_same_every_time() -> None:
-    field, x = Siren(8, 2).to(DEVICE), on_device(20, 3)
-    books = []
-    for _ in range(2):
-        with standin.counted() as book:
-            field.zero_grad()
-            field.jet(x).gradient.square().sum().backward()
-        books.append(book)
-    assert books[0].launches == books[1].launches
-    assert books[0].kernels > 0
-    assert books[0].synchronisations == 0
 
 
 def test_modules_and_their_gradients() -> None:
@@ -201,8 +177,7 @@ def test_modules_and_their_gradients() -> None:
         assert a.equal(b.detach().cpu())
         assert b.detach().equal(c.detach())
         assert b.data_ptr() != c.data_ptr()
-    assert {p.dtype for p in there.double().parameters()} == {torch.float64}
-    assert {p.inner.dtype for p in there.parameters()} == {torch.float64}
+    assert {dtype for p in there.double().parameters() for dtype in (p.dtype, p.inner.dtype)} == {torch.float64}
 
 
 def test_states_are_saved_and_loaded() -> None:
@@ -214,31 +189,6 @@ def test_states_are_saved_and_loaded() -> None:
     other = torch.nn.Linear(3, 2).to(DEVICE)
     other.load_state_dict(back)
     assert other.weight.equal(there.weight)
-
-
-@pytest.mark.parametrize("taper", [0.0, 0.5])
-def test_fields_are_the_cpus_to_the_last_bit(taper: float) -> None:
-    field = small_multiscale(taper)
-    twin = copy.deepcopy(field).to(DEVICE)
-    x = 2 * torch.rand(300, 3) - 1
-    y = x.to(DEVICE)
-    assert twin.value(y).cpu().equal(field.value(x))
-    for a, b in zip(twin.second_jet(y), field.second_jet(x), strict=True):
-        assert a.detach().cpu().equal(b.detach())
-    for place, points in ((field, x), (twin, y)):
-        jet = place.jet(points)
-        (jet.value.square().sum() + jet.gradient.square().sum()).backward()
-    for a, b in zip(twin.parameters(), field.parameters(), strict=True):
-        assert a.grad.cpu().equal(b.grad)
-
-
-def test_rays_are_the_cpus_to_the_last_bit() -> None:
-    origins, directions = some_rays(200)
-    for field in (Sphere(radius=0.5), Torus(major=0.5, minor=0.2)):
-        here = sphere_trace(field, origins, directions)
-        there = sphere_trace(copy.deepcopy(field).to(DEVICE), origins.to(DEVICE), directions.to(DEVICE))
-        for a, b in zip(there, here, strict=True):
-            assert a.cpu().equal(b)
 
 
 def test_a_field_that_forgets_its_device_is_caught() -> None:

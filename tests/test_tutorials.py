@@ -29,10 +29,8 @@ def run(words: list[str], folder: Path) -> str:
     """Run Python in a folder, with one thread, away from this tree."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
     environment.pop("PYTHONPATH", None)
-    done = subprocess.run(
-        [sys.executable, "-W", "error::DeprecationWarning:__main__", *words],
-        cwd=folder, env=environment, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    words = [sys.executable, "-W", "error::DeprecationWarning:__main__", *words]
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
 
@@ -60,7 +58,7 @@ LONG = ("photographs", "shape_interpolation")
 def test_a_tutorial_runs_in_an_empty_folder(name: str, tmp_path: Path) -> None:
     out = run([str(FOLDER / f"{name}.py"), "--small"], tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(LEAVES[name])
-    assert LEAVES[name][1].split(".")[0] in out or LEAVES[name][-1] in out  # it says what it has kept
+    assert LEAVES[name][1].split(".")[0] in out or LEAVES[name][-1] in out  # what was kept is printed
     check_kept(tmp_path)
 
 
@@ -92,10 +90,3 @@ def test_the_index_names_them_all() -> None:
     assert set(re.findall(r"\((\w+)\.py\)", index)) == set(LEAVES) == {path.stem for path in FOLDER.glob("*.py")}
     for names in LEAVES.values():
         assert all(f"`{name}" in index for name in names if name != "scan.ply")
-
-
-def test_cells_are_cut_where_the_script_says() -> None:
-    script = "# %% [markdown]\n# # Title\n#\n# Words\n\n# %%\nx = 1  # a comment\n\n# not words\n"
-    assert cells_of(script) == [("markdown", "# Title\n\nWords"), ("code", "x = 1  # a comment\n\n# not words")]
-    with pytest.raises(ValueError, match="expected '# %%' first"):
-        cells_of("x = 1\n")

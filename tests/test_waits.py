@@ -27,25 +27,21 @@ def test_cones_are_looked_at_once_for_each_size_of_tiles() -> None:
     across = torch.linspace(-0.4, 0.4, 24)
     rows, columns = torch.meshgrid(across, across, indexing="ij")
     directions = torch.stack((columns, rows, torch.ones_like(rows)), dim=-1)
-    origin = torch.tensor([0.0, 0.0, -2.2])
-    near = cone_starts(Sphere(radius=0.5), origin, directions, tiles=(8, 4))
+    field, origin = Sphere(radius=0.5), torch.tensor([0.0, 0.0, -2.2])
+    near = cone_starts(field, origin, directions, tiles=(8, 4))
+    there = [part.to(waits.DEVICE) for part in (field, origin, directions)]
     with standin.counted() as ledger:
-        ahead = cone_starts(
-            Sphere(radius=0.5).to(waits.DEVICE), origin.to(waits.DEVICE), directions.to(waits.DEVICE), tiles=(8, 4)
-        )
+        ahead = cone_starts(*there, tiles=(8, 4))
     assert torch.equal(ahead.cpu(), near)
-    looks = sum(
-        times for (_, where), times in ledger.waits.items() if where.startswith("neural_fields/tracing/cones.py")
-    )
-    assert looks == 2, ledger.report()
+    looks = [times for (_, where), times in ledger.waits.items() if where.startswith("neural_fields/tracing/cones.py")]
+    assert sum(looks) == 2, ledger.report()
 
 
 @pytest.mark.parametrize("name", ["value", "jet"])
 def test_fixed_shapes_need_no_wait(name: str) -> None:
     ask = getattr(waits.MultiscaleSDF, name)
-    assert waits.evaluating(name, waits.in_fixed_shapes(ask)).ledger.synchronisations == 0
-    usual = waits.evaluating(name, ask).ledger
-    assert usual.synchronisations == 2  # a look for each residual
+    assert waits.evaluating(name, ask, fixed=True).ledger.synchronisations == 0
+    assert waits.evaluating(name, ask).ledger.synchronisations == 2  # one for each residual
 
 
 def test_training_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,6 @@
 """How often an accelerator keeps the host waiting: ``python tests/waits.py``, counted on the stand-in of `standin`.
 
-Each row is a piece of work, counted per pass of the tracer, picture, call or training step. The counts do not depend on
-the machine. With ``--where``, the lines that wait most.
+A row is one workload, per pass, picture, call or training step. With ``--where``, the lines that wait most.
 """
 
 import argparse
@@ -13,6 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import standin
 import torch
@@ -20,7 +20,7 @@ from mplicits.datasets import sample_torus, write_cloud_ply
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_neus
-from mplicits.neural_fields import Field, MultiscaleSDF, Siren, sphere_trace
+from mplicits.neural_fields import Field, MultiscaleSDF, sphere_trace
 from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
 from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.cli.entry import main as command
@@ -31,22 +31,13 @@ from torch import Tensor
 DEVICE = torch.device(standin.NAME)
 FIT = "--widths 16 16 16 --depths 1 1 1 --omegas 5 10 20 --steps 40 20 20 --learning-rates 1e-2 1e-3 1e-3"
 FIT += " --batch 128 --samples 500 --quiet"
-RECONSTRUCT = (
-    "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --color-grid 8 --steps 20 --rays 16 --uniform 8"
-)
-RECONSTRUCT += " --importance 4 --texture-steps 20 --quiet"
+RECONSTRUCT = "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --color-grid 8 --steps 20 --rays 16"
+RECONSTRUCT += " --uniform 8 --importance 4 --texture-steps 20 --quiet"
 
 
 @dataclass
 class Row:
-    """Counts of one piece of work.
-
-    Attributes:
-        name: of the work.
-        unit: what is counted per.
-        count: how many units there were.
-        ledger: what was counted.
-    """
+    """Counts of one workload, over ``count`` units."""
 
     name: str
     unit: str
@@ -61,10 +52,8 @@ class Row:
 def three_levels() -> MultiscaleSDF:
     """A sphere of radius ½ with two untrained residuals of the paper's sizes, small, in bands that most rays enter."""
     torch.manual_seed(0)
-    field = MultiscaleSDF.from_widths(
-        [(128, 2), (256, 2), (400, 2)], omegas=[10, 45, 100], deltas=[0.03, 0.015], residual_gain=0.01
-    )
-    assert isinstance(field.base, Siren)
+    sizes, omegas, deltas = [(128, 2), (256, 2), (400, 2)], [10, 45, 100], [0.03, 0.015]
+    field = MultiscaleSDF.from_widths(sizes, omegas=omegas, deltas=deltas, residual_gain=0.01)
     solve_sphere(field.base)
     return field.requires_grad_(False)
 
@@ -79,18 +68,15 @@ def some_rays(count: int) -> tuple[Tensor, Tensor]:
 
 @contextlib.contextmanager
 def passes_of(field: type[Field]) -> Iterator[list[int]]:
-    """How often values of ``field`` are asked for inside the ``with``, by rows asked."""
+    """The numbers of rows of the evaluations of ``field`` inside the ``with``."""
     asked, value = [], field.value
 
     def watched(self: Field, x: Tensor, *, level: int = -1) -> Tensor:
         asked.append(len(x))
         return value(self, x, level=level)
 
-    field.value = watched
-    try:
+    with mock.patch.object(field, "value", watched):
         yield asked
-    finally:
-        field.value = value
 
 
 def tracing(count: int = 500) -> Row:
@@ -111,25 +97,18 @@ def drawing(size: int = 64) -> Row:
     return Row(f"`trace_view`, {size}², three levels", "picture", 1, ledger)
 
 
-def in_fixed_shapes(ask: Callable[[MultiscaleSDF, Tensor], object]) -> Callable[[MultiscaleSDF, Tensor], object]:
-    def asked(field: MultiscaleSDF, x: Tensor) -> object:
-        with fixed_shapes():
-            return ask(field, x)
-
-    return asked
-
-
-def evaluating(name: str, ask: Callable[[MultiscaleSDF, Tensor], object]) -> Row:
+def evaluating(name: str, ask: Callable[[MultiscaleSDF, Tensor], object], *, fixed: bool = False) -> Row:
+    """One evaluation, in fixed shapes or not."""
     field = three_levels().to(DEVICE)
     x = some_rays(1000)[0].to(DEVICE) * torch.linspace(0.2, 0.3, 1000, device=DEVICE)[:, None]
-    with standin.counted() as ledger:
+    with standin.counted() as ledger, fixed_shapes() if fixed else contextlib.nullcontext():
         ask(field, x)
     return Row(name, "call", 1, ledger)
 
 
 @contextlib.contextmanager
 def counted_steps() -> Iterator[dict[str, list[standin.Ledger]]]:
-    """What each training step inside the ``with`` asks, by stage."""
+    """The counts of each training step inside the ``with``, by stage."""
     step, stages = Trainer._step, {}
 
     def watched(self: Trainer) -> object:
@@ -138,15 +117,11 @@ def counted_steps() -> Iterator[dict[str, list[standin.Ledger]]]:
         stages.setdefault(self.stage, []).append(ledger)
         return result
 
-    Trainer._step = watched
-    try:
+    with mock.patch.object(Trainer, "_step", watched):
         yield stages
-    finally:
-        Trainer._step = step
 
 
-def training(words: str, names: dict[str, str]) -> list[Row]:
-    """The steps of a command, by stage."""
+def training(words: str, name: str) -> list[Row]:
     with counted_steps() as stages, contextlib.redirect_stdout(io.StringIO()):
         assert command([*words.split(), "--device", standin.NAME]) == 0
     rows = []
@@ -155,26 +130,24 @@ def training(words: str, names: dict[str, str]) -> list[Row]:
         for ledger in steps:
             together.waits.update(ledger.waits)
             together.launches.update(ledger.launches)
-        rows.append(Row(f"{names['']}, {names.get(stage, stage)}", "step", len(steps), together))
+        rows.append(Row(f"{name}, {stage}", "step", len(steps), together))
     return rows
 
 
 def rows() -> Iterator[Row]:
-    """All of them; works in the current folder."""
     yield tracing()
     yield drawing()
     for name, ask in (("value", MultiscaleSDF.value), ("jet", MultiscaleSDF.jet)):
         yield evaluating(f"`MultiscaleSDF.{name}`", ask)
-        yield evaluating(f"`MultiscaleSDF.{name}` in `fixed_shapes`", in_fixed_shapes(ask))
+        yield evaluating(f"`MultiscaleSDF.{name}` in `fixed_shapes`", ask, fixed=True)
     yield from trainings()
 
 
 def trainings() -> Iterator[Row]:
-    """The steps of the trainings; works in the current folder."""
     write_cloud_ply(Path("scan.ply"), sample_torus(400))
-    yield from training(f"fit scan.ply -o run {FIT}", {"": "`fit`"})
+    yield from training(f"fit scan.ply -o run {FIT}", "`fit`")
     write_neus(Path("photos"), render_scene(SCENES["painted-sphere"](), views=6, size=12, samples=2))
-    yield from training(f"reconstruct photos -o photographed {RECONSTRUCT}", {"": "`reconstruct`"})
+    yield from training(f"reconstruct photos -o photographed {RECONSTRUCT}", "`reconstruct`")
 
 
 def main() -> None:

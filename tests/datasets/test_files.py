@@ -7,21 +7,15 @@ import cv2
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from mplicits.datasets import read_cloud, read_depth
-from mplicits.datasets.files import (
-    decode_image,
-    finite_number,
-    read_arrays,
-    read_image,
-    read_json,
-    read_rgb,
-    rgb_and_alpha,
-    unit_range,
-)
-from mplicits.neural_fields import InputError
+from mplicits.datasets import files, read_cloud, read_depth
+from mplicits.datasets.files import read_arrays, read_image, read_json, read_rgb
 from mplicits.neural_fields.backend.files import files_in
+from refusals import refused
 
 RGBA = np.random.default_rng(0).integers(0, 256, (3, 5, 4)).astype(np.uint8)
+
+
+HUGE = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 10_000, 10_000, 16, 0, 0, 0, 0)
 
 
 def stored(extension, image):
@@ -35,14 +29,13 @@ def test_images_keep_their_bits_and_channels(kind, extension, channels):
     values = RGBA.astype(kind) * (257 if kind is np.uint16 else 1)
     expected = values[..., 0] if channels == 1 else values[..., :channels]
     blue_first = expected if channels == 1 else values[..., [2, 1, 0, 3][:channels]]
-    found = decode_image(stored(extension, blue_first))
+    found = files.decode_image(stored(extension, blue_first))
     assert found.dtype == kind
     assert np.array_equal(found, expected)
-    rgb, alpha = rgb_and_alpha(found)
+    rgb, alpha = files.rgb_and_alpha(found)
     assert np.array_equal(rgb, np.repeat(values[..., :1], 3, axis=2) if channels == 1 else values[..., :3])
-    assert (alpha is None) == (channels < 4)
-    assert alpha is None or np.array_equal(alpha, values[..., 3])
-    assert np.abs(unit_range(rgb) - rgb / np.iinfo(kind).max).max() < 1e-7
+    assert alpha is None if channels < 4 else np.array_equal(alpha, values[..., 3])
+    assert np.abs(files.unit_range(rgb) - rgb / np.iinfo(kind).max).max() < 1e-7
 
 
 def test_what_opencv_does_not_know_pillow_may(tmp_path):
@@ -54,8 +47,8 @@ def test_floating_point_images_are_no_pictures_of_8_or_16_bits(tmp_path):
     values = np.array([[-1.0, 0.25], [0.5, 3.0]], np.float32)
     (tmp_path / "a.tif").write_bytes(stored(".tif", values))
     assert np.array_equal(read_image(tmp_path / "a.tif"), values)
-    assert np.array_equal(unit_range(values), values.clip(0, 1))
-    with pytest.raises(InputError, match=r"a\.tif: float32 of shape \(2, 2\); expected a picture with 8 or 16 bits"):
+    assert np.array_equal(files.unit_range(values), values.clip(0, 1))
+    with refused(tmp_path / "a.tif", r"float32 of shape \(2, 2\)"):
         read_rgb(tmp_path / "a.tif")
 
 
@@ -64,7 +57,7 @@ def test_arrays_by_name_or_alone(tmp_path):
     assert np.array_equal(read_arrays(tmp_path / "a.npy"), RGBA)
     np.savez(tmp_path / "b.npz", one=RGBA, two=np.array([None]))
     assert list(read_arrays(tmp_path / "b.npz", lambda names: [names[0]])) == ["one"]
-    with pytest.raises(InputError, match=r"b\.npz: two: holds Python objects; export it again as plain numbers"):
+    with refused(tmp_path / "b.npz", "two: holds Python objects"):
         read_arrays(tmp_path / "b.npz")
 
 
@@ -80,16 +73,15 @@ def test_arrays_by_name_or_alone(tmp_path):
         (read_image, None, "no such file; check the path"),
         (read_image, b"", "cannot be decoded as an image"),
         (read_image, b"\x89PNG\r\n\x1a\n", "cannot be decoded as an image"),
+        pytest.param(read_image, HUGE + bytes(100_000), "10000 × 10000 pixels", id="claims too many pixels"),
     ],
 )
 def test_what_is_wrong_is_one_line_that_names_the_file(tmp_path, read, content, message):
     path = tmp_path / "file"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(path, message):
         read(path)
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
 
 
 def test_names_are_in_natural_order(tmp_path):
@@ -110,15 +102,8 @@ def test_what_is_no_file_is_one_line(tmp_path, read, kind):
         path.mkdir()
     elif kind == "device":
         path.symlink_to("/dev/zero")
-    with pytest.raises(InputError, match=r"is a pipe or a device|cannot be read|is a directory"):
+    with refused(path, "is a pipe or a device|cannot be read|is a directory"):
         read(path)
-
-
-def test_images_that_claim_too_much(tmp_path):
-    head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 10_000, 10_000, 16, 0, 0, 0, 0)
-    (tmp_path / "a.png").write_bytes(head + bytes(100_000))
-    with pytest.raises(InputError, match="10000 × 10000 pixels in"):
-        read_image(tmp_path / "a.png")
 
 
 def test_archives_of_a_version_to_come(tmp_path):
@@ -126,12 +111,12 @@ def test_archives_of_a_version_to_come(tmp_path):
     data = (tmp_path / "a.npz").read_bytes()
     at = data.find(b"PK\x01\x02")
     (tmp_path / "a.npz").write_bytes(data[: at + 6] + struct.pack("<H", 99) + data[at + 8 :])
-    with pytest.raises(InputError, match="damaged or not a NumPy file"):
+    with refused(tmp_path / "a.npz", "damaged or not a NumPy file"):
         read_arrays(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("value", [True, "1", None, float("nan"), float("inf"), [1.0]])
 def test_numbers_of_json_are_finite(value):
-    assert finite_number(3, "a.json: fx") == 3.0
-    with pytest.raises(InputError, match=r"a\.json: fx: .*; expected a finite number"):
-        finite_number(value, "a.json: fx")
+    assert files.finite_number(3, "a.json: fx") == 3.0
+    with refused("a.json: fx: ", "finite number"):
+        files.finite_number(value, "a.json: fx")

@@ -1,5 +1,3 @@
-"""What is written as landmarks is read as the same."""
-
 from pathlib import Path
 
 import numpy as np

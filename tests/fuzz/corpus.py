@@ -1,8 +1,5 @@
 """Small whole files of every kind that the package reads, and what reads each."""
 
-from __future__ import annotations
-
-import io
 import json
 import random
 import struct
@@ -15,23 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from mplicits.datasets import (
-    SCENES,
-    PointCloud,
-    prepare_cloud,
-    read_cameras,
-    read_cloud,
-    read_depth,
-    read_intrinsics,
-    read_posed_images,
-    read_poses,
-    read_textured,
-    render_scene,
-    write_cloud_ply,
-    write_colmap,
-    write_neus,
-    write_transforms,
-)
+from mplicits import datasets
 from mplicits.neural_fields import MultiscaleSDF, Siren, load_field, save_field
 from mplicits.neural_fields.backend.files import write_json
 from mplicits.neural_fields.meshing.glb import write_glb
@@ -51,20 +32,12 @@ FACES = np.concatenate((QUADS[:, :3], QUADS[:, [0, 2, 3]], [[0, 8, 9], [7, 9, 8]
 
 @dataclass(frozen=True)
 class Specimen:
-    """A whole file, and how it is read.
+    """A whole file, and how it is read."""
 
-    Attributes:
-        name: of the file, from the folder that it lies in; the part before a ``/`` tells specimens apart.
-        data: its bytes.
-        read: what is asked to read it, given its path.
-        beside: other files of the same folder, by name.
-        damage: how it is damaged.
-    """
-
-    name: str
+    name: str  # from the folder that it lies in; the part before a ``/`` tells specimens apart
     data: bytes
-    read: Callable[[Path], object]
-    beside: dict[str, bytes] = field(default_factory=dict)
+    read: Callable[[Path], object]  # of its path
+    beside: dict[str, bytes] = field(default_factory=dict)  # other files of the same folder, by name
     damage: Damage = damaged
 
 
@@ -79,33 +52,27 @@ def _clouds(folder: Path) -> Iterator[Specimen]:
     points = random_.normal(size=(40, 3)).round(4)
     normals = (points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
     colors = random_.uniform(size=(40, 3)).astype(np.float32)
-    cloud = PointCloud(points, normals, colors, "cloud")
-    write_cloud_ply(folder / "cloud.ply", cloud)
-    yield Specimen("cloud.ply", (folder / "cloud.ply").read_bytes(), read_cloud)
+    cloud = datasets.PointCloud(points, normals, colors, "cloud")
+    datasets.write_cloud_ply(folder / "cloud.ply", cloud)
+    yield Specimen("cloud.ply", (folder / "cloud.ply").read_bytes(), datasets.read_cloud)
     rows = "\n".join(" ".join(f"{value:g}" for value in row) for row in np.hstack((points, normals)))
-    yield Specimen("cloud.xyz", rows.encode(), read_cloud)
-    yield Specimen("prepared.xyz", rows.encode(), lambda path: prepare_cloud(read_cloud(path)))
-    yield Specimen("cloud.csv", ("x,y,z,nx,ny,nz\n" + rows.replace(" ", ",")).encode(), read_cloud)
+    yield Specimen("cloud.xyz", rows.encode(), datasets.read_cloud)
+    yield Specimen("prepared.xyz", rows.encode(), lambda path: datasets.prepare_cloud(datasets.read_cloud(path)))
+    yield Specimen("cloud.csv", ("x,y,z,nx,ny,nz\n" + rows.replace(" ", ",")).encode(), datasets.read_cloud)
     for order, name in (("<", "little"), (">", "big"), ("", "ascii")):
         for polygons, label in ((FACES, "even"), (list(QUADS[:3]) + list(FACES[6:]), "uneven")):
-            yield Specimen(f"{label}_{name}.ply", _mesh_ply(order, polygons), read_cloud)
-    for save, suffix, arrays in (
-        (np.save, "npy", (np.hstack((points, normals)),)),
-        (np.savez_compressed, "npz", None),
-    ):
-        memory = io.BytesIO()
-        if arrays is None:
-            save(memory, points=points, normals=normals, colors=colors)  # pyright: ignore[reportCallIssue]
-        else:
-            save(memory, *arrays)
-        yield Specimen(f"cloud.{suffix}", memory.getvalue(), read_cloud)
+            yield Specimen(f"{label}_{name}.ply", _mesh_ply(order, polygons), datasets.read_cloud)
+    np.save(folder / "cloud.npy", np.hstack((points, normals)))
+    np.savez_compressed(folder / "cloud.npz", points=points, normals=normals, colors=colors)
+    for name in ("cloud.npy", "cloud.npz"):
+        yield Specimen(name, (folder / name).read_bytes(), datasets.read_cloud)
     import laspy
 
     las = laspy.create(point_format=3, file_version="1.2")
     las.x, las.y, las.z = points.T
     las.red, las.green, las.blue = (colors.T * 65535).astype(np.uint16)
     las.write(folder / "cloud.las")
-    yield Specimen("cloud.las", (folder / "cloud.las").read_bytes(), read_cloud)
+    yield Specimen("cloud.las", (folder / "cloud.las").read_bytes(), datasets.read_cloud)
 
 
 def _mesh_ply(order: str, polygons: Any) -> bytes:
@@ -135,57 +102,55 @@ def _meshes(folder: Path) -> Iterator[Specimen]:
     ).encode()
     material = b"newmtl red\nKd 1 0.2 0.1\nmap_Kd cube.png\n"
     picture = _png(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
-    yield Specimen("cube.obj", obj, read_textured, {"cube.mtl": material, "cube.png": picture})
-    yield Specimen("points.obj", obj, read_cloud, {"cube.mtl": material, "cube.png": picture})
-    yield Specimen("cube.mtl", material, _beside(read_textured, "cube.obj"), {"cube.obj": obj, "cube.png": picture})
-    yield Specimen("cube.png", picture, _beside(read_textured, "cube.obj"), {"cube.obj": obj, "cube.mtl": material})
-    yield Specimen("cube.ply", _mesh_ply("<", FACES), read_textured)
+    yield Specimen("cube.obj", obj, datasets.read_textured, {"cube.mtl": material, "cube.png": picture})
+    yield Specimen("points.obj", obj, datasets.read_cloud, {"cube.mtl": material, "cube.png": picture})
+    read = _beside(datasets.read_textured, "cube.obj")
+    yield Specimen("cube.mtl", material, read, {"cube.obj": obj, "cube.png": picture})
+    yield Specimen("cube.png", picture, read, {"cube.obj": obj, "cube.mtl": material})
+    yield Specimen("cube.ply", _mesh_ply("<", FACES), datasets.read_textured)
     corners = CUBE[FACES].astype("<f4")
-    yield Specimen(
-        "cube.off",
-        (f"OFF\n{len(CUBE)} {len(FACES)} 0\n" + "\n".join("{:g} {:g} {:g}".format(*v) for v in CUBE) + "\n").encode()
-        + "\n".join("3 {} {} {}".format(*face) for face in FACES).encode(),
-        read_cloud,
-    )
+    off = [f"OFF\n{len(CUBE)} {len(FACES)} 0", *("{:g} {:g} {:g}".format(*vertex) for vertex in CUBE)]
+    off += ["3 {} {} {}".format(*face) for face in FACES]
+    yield Specimen("cube.off", "\n".join(off).encode(), datasets.read_cloud)
     facets = b"".join(struct.pack("<12fH", 0, 0, 1, *triangle.reshape(-1), 0) for triangle in corners)
-    yield Specimen("cube.stl", b"\0" * 80 + struct.pack("<I", len(corners)) + facets, read_cloud)
+    yield Specimen("cube.stl", b"\0" * 80 + struct.pack("<I", len(corners)) + facets, datasets.read_cloud)
     lines = "".join(
         "facet normal 0 0 1\nouter loop\n"
         + "".join("vertex {:g} {:g} {:g}\n".format(*corner) for corner in triangle)
         + "endloop\nendfacet\n"
         for triangle in corners
     )
-    yield Specimen("words.stl", f"solid cube\n{lines}endsolid cube\n".encode(), read_cloud)
+    yield Specimen("words.stl", f"solid cube\n{lines}endsolid cube\n".encode(), datasets.read_cloud)
     color = np.full((len(CUBE), 3), 0.5, np.float32)
     glb = folder / "cube.glb"
     write_glb(glb, FACES, {"POSITION": CUBE.astype(np.float32), "COLOR_0": color})
-    yield Specimen("cube.glb", glb.read_bytes(), read_textured)
-    yield Specimen("described.glb", glb.read_bytes(), read_textured, damage=_within_glb)
+    yield Specimen("cube.glb", glb.read_bytes(), datasets.read_textured)
+    yield Specimen("described.glb", glb.read_bytes(), datasets.read_textured, damage=_within_glb)
 
 
 def _views(folder: Path) -> Iterator[Specimen]:
-    images = render_scene(SCENES["painted-sphere"](), 2, 12, samples=1)
+    images = datasets.render_scene(datasets.SCENES["painted-sphere"](), 2, 12, samples=1)
     for name, write, chosen in (
-        ("neus", write_neus, ("cameras_sphere.npz",)),
-        ("transforms", write_transforms, ("transforms.json",)),
-        ("binary", write_colmap, ("cameras.bin", "images.bin", "points3D.bin")),
-        ("text", lambda f, i: write_colmap(f, i, form="text"), ("cameras.txt", "images.txt", "points3D.txt")),
+        ("neus", datasets.write_neus, ("cameras_sphere.npz",)),
+        ("transforms", datasets.write_transforms, ("transforms.json",)),
+        ("binary", datasets.write_colmap, ("cameras.bin", "images.bin", "points3D.bin")),
+        ("text", lambda f, i: datasets.write_colmap(f, i, form="text"), ("cameras.txt", "images.txt", "points3D.txt")),
     ):
         write(folder / name, images)
         files = {p.relative_to(folder / name).as_posix(): p.read_bytes() for p in (folder / name).rglob("*.*")}
         for file, data in files.items():
             if Path(file).name in chosen:
                 beside = {other: content for other, content in files.items() if other != file}
-                yield Specimen(file, data, _above(read_posed_images, file), beside)
+                yield Specimen(file, data, _above(datasets.read_posed_images, file), beside)
                 if file.endswith(".json"):
-                    yield Specimen(file, data, read_cameras, beside, _as_json)
+                    yield Specimen(file, data, datasets.read_cameras, beside, _as_json)
     depth = np.full((6, 8), 1000, np.uint16)
-    yield Specimen("depth.png", _png(depth), lambda path: read_depth(path, scale=1000.0))
+    yield Specimen("depth.png", _png(depth), lambda path: datasets.read_depth(path, scale=1000.0))
     lens = {"width": 8, "height": 6, "fx": 8.0, "fy": 8.0, "cx": 3.5, "cy": 2.5}
-    yield Specimen("lens.json", json.dumps(lens).encode(), read_intrinsics)
-    yield Specimen("lens.json", json.dumps(lens).encode(), read_intrinsics, damage=_as_json)
+    yield Specimen("lens.json", json.dumps(lens).encode(), datasets.read_intrinsics)
+    yield Specimen("lens.json", json.dumps(lens).encode(), datasets.read_intrinsics, damage=_as_json)
     log = "".join(f"{i} {i} 0\n" + "\n".join(" ".join(map(str, row)) for row in np.eye(4)) + "\n" for i in range(3))
-    yield Specimen("poses.log", log.encode(), read_poses)
+    yield Specimen("poses.log", log.encode(), datasets.read_poses)
 
 
 def _runs(folder: Path) -> Iterator[Specimen]:
@@ -215,7 +180,6 @@ def _png(pixels: np.ndarray) -> bytes:
 
 
 def _beside(read: Callable[[Path], object], name: str) -> Callable[[Path], object]:
-    """Read another file of the same folder."""
     return lambda path: read(path.parent / name)
 
 
@@ -239,12 +203,16 @@ def _within_glb(data: bytes, chance: random.Random) -> bytes:
 
 
 def _within_safetensors(data: bytes, chance: random.Random) -> bytes:
-    """Damage to our own description within the head, in a file whose lengths fit."""
+    """Damage to our own description within the head."""
+    return described_anew(data, lambda described: damaged_json(described, chance))
+
+
+def described_anew(data: bytes, change: Callable[[Any], Any]) -> bytes:
+    """A safetensors file with another description within the head, whose lengths fit."""
     (length,) = struct.unpack_from("<Q", data)
     head = json.loads(data[8 : 8 + length])
     (form,) = head["__metadata__"]
-    described = damaged_json(json.loads(head["__metadata__"][form]), chance)
-    head["__metadata__"][form] = json.dumps(described)
+    head["__metadata__"][form] = json.dumps(change(json.loads(head["__metadata__"][form])))
     text = json.dumps(head).encode()
     text += b" " * (-len(text) % 8)
     return struct.pack("<Q", len(text)) + text + data[8 + length :]

@@ -1,10 +1,7 @@
-"""Damaged files, one after the other, in a process that may die of them: what became of each.
+"""Damaged files, one after the other, in a process that may die of them: `python tests/fuzz/hunt.py --minutes 30`.
 
-`python tests/fuzz/hunt.py --minutes 30` goes on for so long and prints a table; what is neither read nor refused in one
-line is kept in `tests/fuzz/found`, from where the tests replay it.
+Prints a table. What is neither read nor refused in one line is kept in `tests/fuzz/found`, for the tests to replay.
 """
-
-from __future__ import annotations
 
 import argparse
 import contextlib
@@ -86,7 +83,7 @@ def outcome_of(number: int, specimen: Specimen, data: bytes, folder: Path) -> Ou
 
 @contextlib.contextmanager
 def _limits(size: int) -> Iterator[None]:
-    """So many seconds and so much memory, for the block."""
+    """Limits on the seconds and the memory of the block."""
 
     def stop(*_: object) -> None:
         raise _Hang

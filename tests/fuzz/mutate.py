@@ -1,12 +1,9 @@
 """Damage: what happens to files on the way, and what somebody might do to them on purpose."""
 
-from __future__ import annotations
-
 import json
 import random
 import re
 import struct
-from collections.abc import Callable
 from typing import Any
 
 NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
@@ -18,6 +15,10 @@ WORDS = (
 INTEGERS = (0, 1, 2, 3, 255, 256, 65535, 2**27, 2**31 - 1, 2**31, 2**32 - 1)
 LONG_INTEGERS = (0, 2**31, 2**40, 2**62, 2**63 - 1, 2**64 - 1)
 FLOATS = (0.0, -0.0, 1e200, 1e307, 1.7e308, 1e-310, float("nan"), float("inf"), float("-inf"), -1.0)
+STRUCTS = (
+    *(("B", (0, 1, 127, 128, 255)), ("H", (0, 1, 2**15, 2**16 - 1))),
+    *(("I", INTEGERS), ("Q", LONG_INTEGERS), ("d", FLOATS)),
+)
 VALUES: tuple[Any, ...] = (
     *(None, True, "", "x", "\u0000", "../../etc", [], {}, [[]], 0, -1, 1, 2.5, 10**6, 10**12, 2**63, 10**30, -(10**30)),
     *(1e-320, 1e30, 1e200, 1e308, float("nan"), float("inf"), [1e308] * 3, list(range(50)), {"a": {"b": []}}),
@@ -70,15 +71,8 @@ def _flip(data: bytes, chance: random.Random) -> bytes:
 def _overwrite(data: bytes, chance: random.Random) -> bytes:
     """A whole number or a floating-point number that is more than anybody expects."""
     order = chance.choice("<>")
-    word = chance.choice(
-        (
-            lambda: struct.pack("B", chance.choice((0, 1, 127, 128, 255))),
-            lambda: struct.pack(order + "H", chance.choice((0, 1, 2**15, 2**16 - 1))),
-            lambda: struct.pack(order + "I", chance.choice(INTEGERS)),
-            lambda: struct.pack(order + "Q", chance.choice(LONG_INTEGERS)),
-            lambda: struct.pack(order + "d", chance.choice(FLOATS)),
-        )
-    )()
+    kind, values = chance.choice(STRUCTS)
+    word = struct.pack(order + kind, chance.choice(values))
     # Heads are short and bodies long: half of the damage goes to the first bytes.
     reach = len(data) if chance.random() < 0.5 else min(len(data), 512)
     at = chance.randrange(reach + 1)
@@ -117,6 +111,4 @@ def _line(data: bytes, chance: random.Random) -> bytes:
     return b"\n".join(lines)
 
 
-DAMAGES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
-    *(_cut, _flip, _overwrite, _overwrite, _remove, _repeat, _number, _number, _line),
-)
+DAMAGES = (_cut, _flip, _overwrite, _overwrite, _remove, _repeat, _number, _number, _line)

@@ -19,7 +19,7 @@ ENCODED = "ours, 256 features"  # the other such rows have as many without an en
 
 
 def set_up(args: argparse.Namespace, clone: Path, scene: Path, row: str, folder: Path) -> None:
-    """A copy of the host in ``folder``, changed for one row, with the schedule squeezed into so many steps."""
+    """A copy of the host in ``folder``, changed for one row, with the schedule squeezed into the given steps."""
     shutil.copytree(clone, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("exp", ".git"))
     runner, conf = folder / "exp_runner.py", folder / "confs" / "wmask.conf"
     wanted = [change for change in changes("NeuS") if row != "host" or "weights_only" in change[1]]
@@ -37,7 +37,7 @@ def set_up(args: argparse.Namespace, clone: Path, scene: Path, row: str, folder:
             path.write_text(path.read_text().replace("device('cuda')", "device('cpu')").replace(".cuda()", ".cpu()"))
     warm_up = max(1, round(args.steps * args.warm_up))
     settings: dict[str, Any] = {"end_iter": args.steps, "warm_up_end": warm_up, "batch_size": args.rays}
-    settings |= {"save_freq": args.steps, "val_freq": 10**9, "val_mesh_freq": 10**9, "report_freq": 10**9}
+    settings |= dict.fromkeys(("val_freq", "val_mesh_freq", "report_freq"), 10**9) | {"save_freq": args.steps}
     settings |= {"n_samples": args.samples, "n_importance": args.samples}
     settings |= {"data_dir": scene.resolve(), "base_exp_dir": "./exp"}
     text = conf.read_text()

@@ -44,11 +44,8 @@ def chosen(scene: Path, views: list[int], folder: Path) -> None:
     (folder / "mask").mkdir()
     images, masks = (sorted((scene / part).glob("*.png")) for part in ("image", "mask"))
     with np.load(scene / "cameras_sphere.npz") as cameras:
-        kept = {
-            f"{key}_mat_{new}": cameras[f"{key}_mat_{old}"]
-            for new, old in enumerate(views)
-            for key in ("world", "scale")
-        }
+        pairs = [(f"{key}_mat_", new, old) for new, old in enumerate(views) for key in ("world", "scale")]
+        kept = {f"{name}{new}": cameras[f"{name}{old}"] for name, new, old in pairs}
     np.savez(folder / "cameras_sphere.npz", allow_pickle=False, **kept)
     for new, old in enumerate(views):
         shutil.copy(images[old], folder / "image" / f"{new:06d}.png")
@@ -68,7 +65,6 @@ class Training:
         self.optimizer, self.schedule = made["optimizer"], made["lr_scheduler"]["scheduler"]
 
     def step(self) -> None:
-        """One step, as Lightning takes it."""
         batch: dict[str, Tensor] = {}
         self.system.on_train_batch_start(batch, self.system.global_step)
         loss = self.system.training_step(batch, self.system.global_step)["loss"]
@@ -78,21 +74,14 @@ class Training:
         self.schedule.step()
         self.system.global_step += 1
 
-    def state(self) -> dict[str, Any]:
-        """What Lightning's checkpoint has."""
-        return {
-            "state_dict": self.system.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "schedule": self.schedule.state_dict(),
-            "global_step": self.system.global_step,
-        }
+    def state(self) -> tuple[list[dict[str, Any]], int]:
+        parts = (self.system, self.optimizer, self.schedule)
+        return [part.state_dict() for part in parts], self.system.global_step
 
-    def load(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
-        self.system.load_state_dict(state["state_dict"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.schedule.load_state_dict(state["schedule"])
-        self.system.global_step = state["global_step"]
+    def load(self, state: tuple[list[dict[str, Any]], int]) -> None:
+        states, self.system.global_step = state
+        for part, kept in zip((self.system, self.optimizer, self.schedule), states, strict=True):
+            part.load_state_dict(kept)
 
 
 @torch.no_grad()
@@ -117,7 +106,6 @@ def colors(system: Any, scene: Any) -> float:
 
 
 def work(scene: Path, seed: int) -> dict[str, Any]:
-    """One training in a copy of the host."""
     sys.path.insert(0, str(Path.cwd()))
     install()
     with cpu_for_cuda():

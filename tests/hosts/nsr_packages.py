@@ -1,8 +1,6 @@
 """What instant-nsr-pl imports and no CPU has: tiny-cuda-nn, nerfacc 0.3.3 and Lightning, as far as it uses them.
 
-`install` puts modules of these names where ``import`` looks. They do what the host expects of the packages, in plain
-PyTorch: a hash grid (Müller et al. 2022), spherical harmonics, marching through an occupancy grid, and weights along
-rays. They are as exact as the packages and much slower; nothing here is fit for more than trying the host.
+`install` puts modules of these names where ``import`` looks: exact, slow, and in plain PyTorch.
 """
 
 import contextlib
@@ -11,52 +9,33 @@ import math
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping
-from itertools import product
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
+from mplicits.neural_fields.networks.grids import HashEncoding
 from torch import Tensor, nn
 
-PRIMES = (1, 2_654_435_761, 805_459_861)
-CORNERS = tuple(product((0, 1), repeat=3))
 WARM_UP, UPDATE_EVERY, DECAY = 256, 16, 0.95  # of the occupancy grid, as in nerfacc
 
 
-class HashGrid(nn.Module):
-    """Features of the eight corners around a point, at several resolutions, from tables (Müller et al. 2022)."""
+class HashGrid(HashEncoding):
+    """Features at points of the unit cube (Müller et al. 2022)."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
-        super().__init__()
-        self.size = 1 << config["log2_hashmap_size"]
-        self.resolutions = [
-            math.floor(config["base_resolution"] * config["per_level_scale"] ** level)
-            for level in range(config["n_levels"])
-        ]
-        rows = [min(self.size, (resolution + 1) ** 3) for resolution in self.resolutions]
-        width = config["n_features_per_level"]
-        self.tables = nn.ParameterList(nn.Parameter(2e-4 * torch.rand(count, width) - 1e-4) for count in rows)
-        self.n_input_dims, self.n_output_dims = 3, width * len(rows)
+        levels, coarsest = config["n_levels"], config["base_resolution"]
+        super().__init__(
+            levels=levels,
+            table_size=1 << config["log2_hashmap_size"],
+            features=config["n_features_per_level"],
+            coarsest=coarsest,
+            finest=round(coarsest * config["per_level_scale"] ** (levels - 1)),
+        )
+        self.n_input_dims, self.n_output_dims = 3, self.size
 
     def forward(self, x: Tensor) -> Tensor:
-        """Points of the unit cube ``(N, 3)`` → ``(N, levels · width)``."""
-        found = []
-        for table, resolution in zip(self.tables, self.resolutions, strict=True):
-            cell = (x.detach() * resolution).floor().clamp(0, resolution - 1)
-            inside, cell = x * resolution - cell, cell.long()
-            total = table.new_zeros(len(x), table.shape[1])
-            for corner in CORNERS:
-                shift = torch.tensor(corner, device=x.device)
-                weight = torch.where(shift.bool(), inside, 1 - inside).prod(dim=-1, keepdim=True)
-                total = total + weight * table[self._row(cell + shift, resolution)]
-            found.append(total)
-        return torch.cat(found, dim=-1)
-
-    def _row(self, corner: Tensor, resolution: int) -> Tensor:
-        x, y, z = corner.unbind(-1)
-        if (resolution + 1) ** 3 <= self.size:
-            return (x * (resolution + 1) + y) * (resolution + 1) + z
-        return ((x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])) & (self.size - 1)
+        return super().forward(2 * x - 1)
 
 
 class SphericalHarmonics(nn.Module):
@@ -78,7 +57,6 @@ class SphericalHarmonics(nn.Module):
 
 
 def encoding(_dims: int, config: Mapping[str, Any]) -> nn.Module:
-    """tiny-cuda-nn's ``Encoding``."""
     return {"HashGrid": lambda: HashGrid(config), "SphericalHarmonics": SphericalHarmonics}[config["otype"]]()
 
 
@@ -182,7 +160,7 @@ class LightningModule(nn.Module):
     global_step, current_epoch, trainer = 0, 0, None
 
     def log(self, name: str, value: object, **_settings: object) -> None:
-        """Lightning's loggers; nobody reads them here."""
+        """Lightning's loggers are not read here."""
 
 
 def install() -> None:
@@ -208,10 +186,7 @@ def install() -> None:
         "torchvision.transforms.functional": {"to_tensor": to_tensor},
         "pytorch_lightning": {"LightningModule": LightningModule, "LightningDataModule": object},
         "pytorch_lightning.utilities": {},
-        "pytorch_lightning.utilities.rank_zero": {
-            "rank_zero_info": lambda *_: None,
-            "rank_zero_debug": lambda *_: None,
-        },
+        "pytorch_lightning.utilities.rank_zero": dict.fromkeys(("rank_zero_info", "rank_zero_debug"), lambda *_: None),
     }
     for name, contents in names.items():
         module = types.ModuleType(name)
@@ -222,9 +197,5 @@ def install() -> None:
 @contextlib.contextmanager
 def cpu_for_cuda() -> Iterator[None]:
     """``torch.cuda.device`` for hosts that say it where there is none."""
-    before = torch.cuda.device
-    torch.cuda.device = lambda _: contextlib.nullcontext()  # pyright: ignore[reportAttributeAccessIssue]
-    try:
+    with mock.patch.object(torch.cuda, "device", return_value=contextlib.nullcontext()):
         yield
-    finally:
-        torch.cuda.device = before  # pyright: ignore[reportAttributeAccessIssue]

@@ -2,16 +2,13 @@
 
     python tests/hosts/run.py --neus path/to/NeuS --data path/to/dtu_scan24 --steps 240 --rays 64 --seeds 0 1 2
 
-The clone and the data stay as they are: what is run is a copy in a temporary folder, in which the document's lines are
-changed (``ours``), its other colour network is not (``ours, 256 features``; ``ours, no encoding`` with all of them the
-field's own, ``ours, deeper`` with the paper's deeper levels too), or nothing is (``host``), and ``cuda`` is ``cpu``
-where there is no GPU. ``--short`` adds NeuS's lines for short trainings to all rows, ``host`` too. The host's own
-packages have to be there: ``pip install pyhocon icecream tqdm PyMCubes`` for NeuS, ``pip install omegaconf matplotlib
-PyMCubes`` for instant-nsr-pl (``--nsr``), whose others have stand-ins.
+Each run is a copy of the clone in a temporary folder: unchanged (``host``), with the document's lines (``ours``), or
+without its other colour network (``ours, 256 features``; ``ours, no encoding``; ``ours, deeper`` has the paper's deeper
+levels too). ``--short`` adds NeuS's lines for short trainings to all rows. Without a GPU, ``cuda`` becomes ``cpu``.
+NeuS needs ``pip install pyhocon icecream tqdm PyMCubes``, instant-nsr-pl ``omegaconf matplotlib PyMCubes``.
 
-Every eighth view is kept from the training, and colours are measured there, on the same rays for all. Where the data
-has a ``surface.ply`` (``mplicits scene``), the mesh is measured against it. With ``--keep FILE`` rows are written to a
-file as they come, and those that it has already are not run again.
+Colours are measured in every eighth view, which is kept from the training, and the mesh against the data's
+``surface.ply`` where there is one. ``--keep FILE`` goes on from the rows in a file, and adds to them.
 """
 
 import argparse
@@ -45,7 +42,6 @@ def run(args: argparse.Namespace, host: str, scene: Path, row: str, seed: int) -
 
 
 def main() -> None:
-    """Run the rows, each in a process of its own, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument("--neus", type=Path, help="clone of NeuS")

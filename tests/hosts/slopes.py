@@ -2,10 +2,8 @@
 
     python tests/hosts/slopes.py --neus path/to/NeuS
 
-A colour loss says where the surface should be, not how steep the field is there: its steps move values, and slopes come
-along. Here Adam's first step at NeuS's rate follows random errors of the values at 256 points in the ball; of what
-changes by it, root mean squares over the ball are compared. The quotient is a frequency, in radians per unit: what the
-eikonal loss has to put right after every step. Needs PyTorch only, besides the clone.
+Adam's first step at NeuS's rate follows random errors of the values at 256 points in the ball. Root mean squares of
+what changes are compared; the quotient is a frequency, in radians per unit, which the eikonal loss has to correct.
 """
 
 import argparse
@@ -16,7 +14,7 @@ from typing import Any
 
 import torch
 from host_common import in_ball
-from mplicits.neural_fields import MultiscaleSDF, NeuSGeometry, Siren, fit_sphere
+from mplicits.neural_fields import MultiscaleSDF, NeuSGeometry, fit_sphere
 from torch import Tensor, nn
 
 RATE = 5e-4  # NeuS's
@@ -50,13 +48,11 @@ def moved(network: Any, x: Tensor) -> tuple[float, float]:
 def sine_network(width: int, depth: int, omega: float) -> nn.Module:
     """A coarse level in NeuS's shell, begun as a sphere."""
     sdf = MultiscaleSDF.from_widths([(width, depth)], omegas=[omega], deltas=[], num_features=256)
-    assert isinstance(sdf.base, Siren)
     fit_sphere(sdf.base, radius=RADIUS)
     return NeuSGeometry(sdf, scale=SCALE, learning_rate=RATE)
 
 
 def main() -> None:
-    """Print one line per network."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--neus", type=Path, required=True, help="clone of NeuS")
     sys.path.insert(0, str(parser.parse_args().neus))

@@ -19,11 +19,7 @@ def run(*words: object) -> str:
 
 @pytest.fixture(scope="module")
 def tools(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the commands of a fresh environment, several gigabytes of it.
-
-    PyPI's torchvision is compiled for PyPI's torch, and fails beside a build such as ``2.13.0+cpu``, which pip takes
-    for newer where it finds one: ``===`` leaves it only the former.
-    """
+    """Commands of a fresh environment; ``===`` keeps pip from builds such as ``2.13.0+cpu``, unfit for torchvision."""
     folder = tmp_path_factory.mktemp("host")
     environment, constraints = folder / "environment", folder / "constraints.txt"
     constraints.write_text((ROOT / "constraints.txt").read_text().replace("torch==", "torch===", 1))

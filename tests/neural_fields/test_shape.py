@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from fields import small_multiscale, small_spacetime
+from fields import small_multiscale
 from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere, WorldField
 
 CENTER = np.array([500_000.25, 4_100_000.5, 120.0])
@@ -13,15 +13,10 @@ BALL = WorldField(Sphere(radius=RADIUS / SCALE), Similarity(tuple(CENTER), SCALE
 ROUNDING = 16 * 2.0**-24 * 2 * SCALE
 
 
-@pytest.fixture
-def offsets() -> np.ndarray:
+def test_arrays_far_from_the_origin_keep_their_digits() -> None:
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(40, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return directions * rng.uniform(4, 16, (40, 1))
-
-
-def test_arrays_far_from_the_origin_keep_their_digits(offsets: np.ndarray) -> None:
+    offsets = directions / np.linalg.norm(directions, axis=1, keepdims=True) * rng.uniform(4, 16, (40, 1))
     lengths = np.linalg.norm(offsets, axis=1)
     found = BALL.distance(CENTER + offsets)
     assert found.dtype == np.float64
@@ -43,8 +38,7 @@ def test_shapes_and_kinds_come_back(shape: tuple[int, ...], kind: str) -> None:
     assert distance.shape == shape[:-1]
     assert normals.shape == closest.position.shape == closest.normal.shape == shape
     assert closest.reached.shape == shape[:-1]
-    if kind == "float32" or kind == "float64":
-        assert distance.dtype == normals.dtype == points.dtype
+    assert distance.dtype == normals.dtype == (torch.float32 if kind == "int64" else points.dtype)
     hits = world.trace(points, points + 1)
     assert hits.mask.shape == hits.depth.shape == shape[:-1]
     assert hits.position.shape == hits.normal.shape == shape
@@ -55,17 +49,17 @@ def test_levels_are_those_of_the_field() -> None:
     world, x = WorldField(field), torch.rand(50, 3, dtype=torch.float64)
     for level in range(3):
         torch.testing.assert_close(world.distance(x, level=level), field.value(x, level=level), rtol=0, atol=0)
-    with pytest.raises(ValueError, match="levels 0 to 2"):
-        world.distance(x, level=3)
 
 
 def test_tensors_carry_their_graph() -> None:
     points = torch.tensor(np.add(CENTER, (0.0, 0.0, 13.0)), requires_grad=True)
     (gradient,) = torch.autograd.grad(BALL.distance(points), points)
-    torch.testing.assert_close(gradient, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    hits = BALL.trace(points, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), differentiable=True)
+    (slope,) = torch.autograd.grad(hits.depth, points)
+    torch.testing.assert_close((gradient, slope), (torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64),) * 2)
     siren = Siren(8, 1)
     WorldField(siren).distance(torch.rand(4, 3)).sum().backward()
-    assert siren.output.weight.grad is not None
+    assert siren.output.weight.grad.any()
 
 
 def test_rays_in_input_units_with_directions_of_any_length() -> None:
@@ -77,29 +71,15 @@ def test_rays_in_input_units_with_directions_of_any_length() -> None:
     np.testing.assert_allclose(hits.normal[0], [0, 0, -1], atol=1e-6)
     assert np.isnan(hits.position[1]).all()
     assert np.isnan(hits.normal[1]).all()
-    with pytest.raises(ValueError, match="two arrays or two tensors"):
-        BALL.trace(origins, torch.tensor([0.0, 0.0, 1.0]))
-
-
-def test_depths_of_tensors_can_be_differentiated() -> None:
-    origin = torch.tensor(np.add(CENTER, (0.0, 0.0, -30.0)), requires_grad=True)
-    hits = BALL.trace(origin, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), differentiable=True)
-    (gradient,) = torch.autograd.grad(hits.depth, origin)
-    torch.testing.assert_close(gradient, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("bounds", [None, (CENTER - 12, CENTER + 12)])
 def test_meshes_lie_where_the_input_was(bounds: tuple[np.ndarray, np.ndarray] | None) -> None:
     mesh = BALL.mesh(48, bounds=bounds)
-    radii = np.linalg.norm(mesh.vertices - CENTER, axis=1)
-    assert abs(radii - RADIUS).max() < 1e-3
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices - CENTER, axis=1), RADIUS, atol=1e-3)
     assert mesh.normals is not None
 
 
-def test_space_time_is_refused_and_a_repr_says_where_it_is() -> None:
-    with pytest.raises(ValueError, match="in_dim=4"):
-        WorldField(small_spacetime())
-    assert repr(BALL) == (
-        "WorldField(center=(500000.25, 4100000.5, 120), scale=20, field=Sphere(radius=0.5, center=(0.0, 0.0, 0.0)))"
-    )
+def test_a_repr_has_the_place_and_the_field() -> None:
+    assert "center=(500000.25, 4100000.5, 120), scale=20, field=Sphere(radius=0.5" in repr(BALL)
     assert "taper=0.3" in repr(WorldField(MultiscaleSDF(Sphere(), [], [], taper=0.3)))

@@ -1,14 +1,9 @@
 """A stand-in accelerator: it keeps its numbers on the CPU, computes there, and refuses what a GPU would refuse.
 
-PyTorch lends a device type to whoever brings a backend ("PrivateUse1"); here it is called ``standin``. A tensor of
-it is a `StandInTensor`, a shell that holds a tensor of the CPU. Each operation on shells comes to `_run`, which
-
-* refuses operands that lie on two devices (but for 0-dimensional tensors of the host where CUDA takes them as numbers,
-  and indices), generators of another device, `.numpy()`, and copies to the host that do not wait;
-* counts launches, and moments at which the host would wait (`ledger.py`);
-* runs the operation on what the shells hold, so that results are those of the CPU to the last bit.
-
-What it cannot show: other roundings, other random numbers, races between streams, and time.
+PyTorch lends a device type to backends ("PrivateUse1"); here it is ``standin``. Its tensors are shells of tensors of
+the CPU, so that results are the CPU's to the last bit. Each operation on shells comes to `_run`, which counts launches
+and waits (`ledger.py`). It refuses operands on two devices, generators of another device, `.numpy()`, and copies to
+the host that do not wait. It cannot show other roundings, races of streams, or time.
 """
 
 from __future__ import annotations
@@ -97,21 +92,11 @@ class StandInTensor(Tensor):
 
 
 class _Operation(NamedTuple):
-    """What there is to know of an operation once and for all.
-
-    Attributes:
-        name: without ``aten::`` and overload.
-        launches: whether it runs anything on the device.
-        numbers: whether it takes 0-dimensional tensors of the host for numbers.
-        written: places and names of the arguments that it writes into and returns.
-        composite: whether it is made of others.
-    """
-
-    name: str
-    launches: bool
-    numbers: bool
-    written: tuple[tuple[int, str], ...]
-    composite: bool
+    name: str  # without ``aten::`` and overload
+    launches: bool  # whether it runs anything on the device
+    numbers: bool  # whether it takes 0-dimensional tensors of the host for numbers
+    written: tuple[tuple[int, str], ...]  # places and names of the arguments that it writes into and returns
+    composite: bool  # whether it is made of others
 
     @classmethod
     @functools.cache
@@ -168,11 +153,7 @@ def _argument(args: Sequence[Any], kwargs: Mapping[str, Any], place: tuple[int, 
 
 
 def _check_hosts(operation: _Operation, args: Any, kwargs: Any, hosts: Sequence[Tensor]) -> None:
-    """Refuse operands of the host beside those of the device.
-
-    Raises:
-        RuntimeError: as CUDA raises.
-    """
+    """Refuse operands of the host beside those of the device, by a RuntimeError as CUDA raises it."""
     written = [_argument(args, kwargs, place) for place in operation.written]
     indices = args[1] if operation.name in INDEXED else ()
     for tensor in hosts:
@@ -180,17 +161,12 @@ def _check_hosts(operation: _Operation, args: Any, kwargs: Any, hosts: Sequence[
             continue
         number = tensor.ndim == 0 and (operation.numbers or operation.name in INDEXED)
         if not number or any(tensor is shell for shell in written):
-            raise RuntimeError(
-                f"Expected all tensors to be on the same device, but found at least two devices, {NAME}:0 and "
-                f"{tensor.device}! ({operation.name}, {tuple(tensor.shape)} on {tensor.device})"
-            )
+            where = f"{operation.name}, {tuple(tensor.shape)} on {tensor.device}"
+            raise RuntimeError(f"Expected all tensors to be on the same device, {NAME}:0, but found {where}")
 
 
 def _note_copy(name: str, args: Any, kwargs: Any) -> None:
-    """Copies inside the device launch a kernel; those that leave it or come into it block.
-
-    Unless they come from pinned memory and are asked not to: other memory is copied there first, when it is its turn.
-    """
+    """Copies inside the device launch a kernel; others block, but for non-blocking ones from pinned memory."""
     if name == "copy_":
         target, source = args[:2]
         asked = args[2] if len(args) > 2 else kwargs.get("non_blocking", False)
@@ -222,7 +198,7 @@ def _note(operation: _Operation, args: Any, kwargs: Any) -> None:
             if not isinstance(index, StandInTensor):
                 note_wait("upload")
         masks = [index for index in indices if index.dtype in (torch.bool, torch.uint8)]
-        # One mask and one number: that is a masked fill, whose size nobody has to know.
+        # One mask and one number: that is a masked fill, whose size does not matter.
         if masks and not (len(indices) == 1 and "put" in name and args[2].ndim == 0):
             note_launch("nonzero")
             note_wait("size")
@@ -272,8 +248,6 @@ def _is_pinned(tensor: Tensor, device: torch.device | None = None) -> bool:
 
 
 class _Module(_DummyBackendModule):
-    """What ``torch.standin`` is."""
-
     def get_amp_supported_dtype(self) -> list[torch.dtype]:
         return [torch.bfloat16, torch.float16]
 

@@ -1,8 +1,4 @@
-"""What a piece of work asks of the device: kernels that it launches, and moments at which the host waits for them.
-
-A GPU works behind the host's back until somebody wants to know something of it. Then the host stands still until all
-that was asked for before is done. On small batches that is most of the time, and no profile of a CPU shows it.
-"""
+"""The kernels that a workload launches on the device, and the moments at which the host waits for them."""
 
 import sys
 from collections import Counter
@@ -21,14 +17,12 @@ UNDER = (f"{Path(torch.__file__).parent}/", f"{Path(__file__).parent}/")
 
 @dataclass
 class Ledger:
-    """Counts of one piece of work.
+    """Counts of one workload.
 
     Attributes:
-        waits: how often the host waited, by (why, where): why is ``item`` (a number is read), ``size`` (the shape of a
-            result depends on numbers: `nonzero`, boolean masks, `unique`), ``download`` or ``upload`` (a copy to or
-            from the host that blocks); where is the line of ours, or whoever's it is.
-        launches: kernels by name of the operation, one for each: views and allocations launch none, and those few
-            operations that are several kernels (sort, nonzero) count as one.
+        waits: how often the host waited, by reason and line. Reasons are ``item`` (a number is read), ``size`` (a
+            shape depends on numbers), ``download`` and ``upload`` (copies to and from the host that block).
+        launches: kernels by name of the operation, one each; views and allocations launch none.
     """
 
     waits: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -52,7 +46,7 @@ _open: list[Ledger] = []
 
 @contextmanager
 def counted() -> Iterator[Ledger]:
-    """Count what is asked of the device inside the ``with``; ledgers may be open inside each other."""
+    """Count launches and waits inside the ``with``; ledgers may be open inside each other."""
     ledger = Ledger()
     _open.append(ledger)
     try:

@@ -9,17 +9,13 @@ from benchmarks.harness.report import as_text
 
 
 def sphere_like():
-    """A small network whose zero set is a closed surface: a sine layer far below its first crest, three times."""
-    base = Siren(3, 1, omega=1.0)
-    residual = Siren(8, 1, omega=5.0, output_gain=0.05)
-    with torch.no_grad():
-        # Σ sin(2.2 xᵢ + π/2) = Σ cos(2.2 xᵢ): convex level sets around the origin.
-        (layer,) = base.layers
-        layer.weight.copy_(2.2 * torch.eye(3))
-        layer.bias.fill_(torch.pi / 2)
-        base.output.weight.fill_(-0.6)
-        base.output.bias.fill_(1.2)
-    return MultiscaleSDF(base, [residual], [0.1])
+    base = Siren(3, 1, omega=1.0).requires_grad_(False)
+    # Σ sin(2.2 xᵢ + π/2) = Σ cos(2.2 xᵢ): convex level sets around the origin.
+    base.layers[0].weight.copy_(2.2 * torch.eye(3))
+    base.layers[0].bias.fill_(torch.pi / 2)
+    base.output.weight.fill_(-0.6)
+    base.output.bias.fill_(1.2)
+    return MultiscaleSDF(base, [Siren(8, 1, omega=5.0, output_gain=0.05)], [0.1])
 
 
 @pytest.mark.slow
@@ -40,9 +36,7 @@ def test_rows_ratios_and_distance(tmp_path):
     assert paper.max_distance < 0.5
     assert all(row.peak is None or 2**27 < row.peak < 2**31 for row in rows)
     assert dense.share == pytest.approx(3 / 65)
-    text = as_text(*bench.tables(rows, sgemm=1e9))
-    assert "64³ → 128³: ×" in text
-    assert "faster than dense SIREN (256,4) at 64³ (timed on 4.6% of the slabs, extrapolated linearly)" in text
+    assert "4.6% of the slabs, extrapolated" in as_text(*bench.tables(rows, sgemm=1e9))
 
 
 def test_a_missing_peer_is_an_input_error_before_any_work(tmp_path, monkeypatch):

@@ -35,8 +35,6 @@ def test_rows_and_table(tmp_path: Path) -> None:
         assert min(row.value_split, row.jet_split, row.value_one, row.jet_one) > 0
         assert row.largest_difference < 1e-3
     costs, threads = map(as_text, bench.tables(rows, sgemm=1e9))
-    assert "(24,3)" in costs
     assert f"{rows[0].jet / rows[0].value:.2f}" in costs
-    assert "1 other process(es)" in threads
     assert f"{rows[1].jet_split / rows[1].jet:.2f}" in threads
     assert f"{rows[1].jet_one / (rows[1].threads * rows[1].jet):.0%}" in threads

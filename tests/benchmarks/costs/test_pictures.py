@@ -55,6 +55,5 @@ def test_samples(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["pictures", str(run), "--device", "cpu", "--sizes", "24", "18", "--repeats", "2", "--points", "300"]
-    assert main(words) == 0
+    assert main(f"pictures {run} --device cpu --sizes 24 18 --repeats 2 --points 300".split()) == 0
     assert "24×18, level 1" in capsys.readouterr().out

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from evolutions import fails
 from mplicits.datasets import look_at, sample_sphere, write_cloud_ply
 from mplicits.neural_fields import Sphere, load_field
 from mplicits.pipelines.render.trace import trace_view
@@ -41,9 +42,8 @@ def bench(tmp_path_factory) -> tuple[list[RenderRow], list[str], Path]:
 @pytest.mark.slow
 def test_rows_of_table_4_in_each_mode(bench):
     rows, said, _ = bench
-    assert [(row.mode, row.model) for row in rows[:2]] == [("adaptive", "(400,4)"), ("adaptive", "(128,2)")]
+    assert [row.model for row in rows[:2]] == ["(400,4)", "(128,2)"]
     assert [row.mode for row in rows] == ["adaptive"] * 8 + ["budget"] * 8 + ["naive"] * 2
-    assert {row.shape for row in rows} == {"ball"}
     assert any("converged trace of 128x2_400x2, level 1" in text for text in said)
     for row in rows:
         assert row.agreement.silhouette > 100
@@ -102,6 +102,5 @@ def test_judging_notices_holes_and_false_hits():
 
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys):
-    assert main(["render", str(tmp_path / "no.ply"), "-o", str(tmp_path / "bench")]) == 2
-    assert "no.ply: no such file" in capsys.readouterr().err
+    assert "no.ply: no such file" in fails(capsys, f"render {tmp_path / 'no.ply'} -o {tmp_path / 'bench'}", main)
     assert not (tmp_path / "bench").exists()

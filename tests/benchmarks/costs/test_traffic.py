@@ -1,5 +1,3 @@
-"""Counts of PyTorch's operations."""
-
 import torch
 from mplicits.neural_fields import Siren
 

@@ -1,5 +1,3 @@
-"""Tables from made-up records, in every format; plots."""
-
 import csv
 import io
 import json
@@ -7,16 +5,8 @@ from xml.etree import ElementTree
 
 import pytest
 
+from benchmarks.harness import report
 from benchmarks.harness.plots import Plot, Series, to_svg
-from benchmarks.harness.report import (
-    Section,
-    as_csv,
-    as_dict,
-    as_markdown,
-    from_dict,
-    section_as_dict,
-    section_from_dict,
-)
 from benchmarks.harness.tables import Column, Row, Table
 from benchmarks.paper.comparison import banf_tables, comparison_tables, noise_plots, noise_tables, poisson_tables
 from benchmarks.paper.published import BANF, COMPARISON, NOISE
@@ -25,23 +15,11 @@ from benchmarks.paper.published import BANF, COMPARISON, NOISE
 def record(shape, method, chamfers, *, iou=0.9, deltas=(), **cell):
     """One whose outputs are named after their Chamfer distances' keys."""
     fields = {"noise": 0.0, "outliers": 0.0, "flipped": 0.0, "overrides": {}, "preset": "smoke", "seed": 0} | cell
-    outputs = [
-        {
-            "name": name,
-            "chamfer": value,
-            "chamfer_floor": 1e-6,
-            "iou": iou,
-            "shell_iou": iou / 2,
-            "components": 3,
-            "parameters": 10,
-            "train_seconds": 30.0,
-            "mesh_seconds": 2.0,
-            "rays_per_second": 512 * 512 * 4.0,
-        }
-        if value is not None
-        else {"name": name, "chamfer": None, "train_seconds": 30.0, "mesh_seconds": 2.0, "parameters": 10}
-        for name, value in chamfers.items()
-    ]
+    found = {"chamfer_floor": 1e-6, "iou": iou, "shell_iou": iou / 2, "components": 3, "rays_per_second": 4 * 512**2}
+    outputs = []
+    for name, value in chamfers.items():
+        output = {"name": name, "chamfer": value, "train_seconds": 30.0, "mesh_seconds": 2.0, "parameters": 10}
+        outputs.append(output | ({} if value is None else found))
     return {
         "cell": {"shape": shape, "method": method, **fields},
         "method": {"source": f"by {method}", "differs": f"not {method}"},
@@ -65,28 +43,16 @@ def test_comparison() -> None:
     ]
     table, chamfer, _, parts = comparison_tables(records)
     rows = rows_of(table)
-    fine = rows["Ours fine"]
-    assert fine["mean CD"] == pytest.approx(3e-5)
-    assert fine["median CD"] == pytest.approx(2e-5)
-    assert fine["mean IoU"] == pytest.approx(0.9)
-    assert fine["mean shell IoU"] == pytest.approx(0.45)
-    assert fine["training (min)"] == pytest.approx(0.5)
-    assert fine["FPS at 512²"] == pytest.approx(4)
-    assert (fine["found"], fine["parameters"], fine["meshing (s)"]) == ("3/3", 10, 2.0)
-    assert rows["IDF"]["found"] == "1/2"
-    assert rows["IDF"]["mean CD"] == 1e-4
+    expected = {"mean CD": 3e-5, "median CD": 2e-5, "mean IoU": 0.9, "mean shell IoU": 0.45, "training (min)": 0.5}
+    expected |= {"FPS at 512²": 4, "parameters": 10, "meshing (s)": 2.0}
+    assert {name: rows["Ours fine"][name] for name in expected} == pytest.approx(expected)
+    assert (rows["Ours fine"]["found"], rows["IDF"]["found"], rows["IDF"]["mean CD"]) == ("3/3", "1/2", 1e-4)
     assert rows["(sampling floor)"]["mean CD"] == pytest.approx(1e-6)
-    assert table.notes[0] == (
-        "The mean Chamfer distance of Ours fine is 3.00 times lower than that of the best other row, Screened Poisson."
-    )
+    assert "3.00 times lower" in table.notes[0]
     by_name = {row.name: row for row in table.rows}
-    published = by_name["IDF"].published
-    assert published is not None
-    assert published[:4] == COMPARISON["IDF"][:4]
-    assert published[-4:] == (1_191_943, 8.26, 42.38, None)
+    assert by_name["IDF"].published[:4] == COMPARISON["IDF"][:4]
     assert by_name["Screened Poisson"].published is None
     assert (by_name["IDF"].source, by_name["IDF"].differs) == ("by idf", "not idf")
-    assert [column.name for column in chamfer.columns] == ["a", "b", "c"]
     assert rows_of(chamfer)["IDF"] == {"a": 1e-4, "b": None, "c": None}
     assert rows_of(parts)["Ours fine"] == {"a": 3, "b": 3, "c": 3}
 
@@ -110,10 +76,7 @@ def test_noise_is_told_from_the_clean_cells_of_its_curves() -> None:
     assert [series.name for series in everything.series] == ["Ours fine", "Screened Poisson", "IDF"]
     assert everything.series[0].values == (2e-5,)
     assert [series.name for series in levels.series] == ["Ours fine"]
-    assert [plot.name for plot in pairs] == [
-        "noise-per-mesh-ours-fine-idf",
-        "noise-per-mesh-ours-fine-screened-poisson",
-    ]
+    assert len(pairs) == 2
 
 
 def test_poisson() -> None:
@@ -145,7 +108,6 @@ def test_banf() -> None:
     (table,) = banf_tables(records)
     (row,) = table.rows
     assert row.values == (1e-5, 2e-5, 3e-5, None, pytest.approx(3), None)
-    assert row.published is not None
     assert row.published[:4] == BANF["armadillo"]
     assert row.published[5] == pytest.approx(7.3, abs=0.05)  # as the paper prints it
 
@@ -165,37 +127,34 @@ TABLE = Table(
 
 
 def test_markdown() -> None:
-    assert as_markdown(TABLE) == "\n".join(
-        [
-            "| method | CD | IoU | found |",
-            "|---|---:|---:|---:|",
-            "| first | **1.0e-05** *(2.0e-05)* | 0.50 | 1/1 |",
-            "| second | 3.0e-05 | **0.75** | 1/1 |",
-            "| floor | 1.0e-06 | – | – |",
-        ]
-    )
+    lines = report.as_markdown(TABLE).splitlines()
+    assert lines[0] == "| method | CD | IoU | found |"
+    assert lines[2:] == [
+        "| first | **1.0e-05** *(2.0e-05)* | 0.50 | 1/1 |",
+        "| second | 3.0e-05 | **0.75** | 1/1 |",
+        "| floor | 1.0e-06 | – | – |",
+    ]
 
 
 def test_csv() -> None:
-    lines = list(csv.DictReader(io.StringIO(as_csv(TABLE))))
+    lines = list(csv.DictReader(io.StringIO(report.as_csv(TABLE))))
     assert [line["method"] for line in lines] == ["first", "second", "floor"]
-    assert float(lines[0]["CD"]) == 1e-5
-    assert float(lines[0]["CD (paper)"]) == 2e-5
+    assert (float(lines[0]["CD"]), float(lines[0]["CD (paper)"])) == (1e-5, 2e-5)
     assert lines[1]["CD (paper)"] == lines[2]["IoU"] == ""
     assert (lines[0]["source"], lines[0]["differs"]) == ("A, B", "it | that")
 
 
 def test_json_gives_the_same_table_back() -> None:
-    assert from_dict(json.loads(json.dumps(as_dict(TABLE)))) == TABLE
-    section = Section("n", "l", "s", (TABLE,), (("p.svg", "P"),), (("s.png", "S"),), (("m", "s", "d"),), ("f",))
-    assert section_from_dict(json.loads(json.dumps(section_as_dict(section)))) == section
+    assert report.from_dict(json.loads(json.dumps(report.as_dict(TABLE)))) == TABLE
+    files = ((("p.svg", "P"),), (("s.png", "S"),), (("m", "s", "d"),), ("f",))
+    section = report.Section("n", "l", "s", (TABLE,), *files)
+    assert report.section_from_dict(json.loads(json.dumps(report.section_as_dict(section)))) == section
 
 
 def test_rows_must_fit() -> None:
-    with pytest.raises(ValueError, match="t: r: 1 values for 2 columns"):
-        Table("t", "T", "h", (Column("a"), Column("b")), (Row("r", (1,)),))
-    with pytest.raises(ValueError, match="3 values for 2 columns"):
-        Table("t", "T", "h", (Column("a"), Column("b")), (Row("r", (1, 2), (1, 2, 3)),))
+    for row, message in ((Row("r", (1,)), "t: r: 1 values for 2"), (Row("r", (1, 2), (1, 2, 3)), "3 values for 2")):
+        with pytest.raises(ValueError, match=message):
+            Table("t", "T", "h", (Column("a"), Column("b")), (row,))
 
 
 def test_a_plot() -> None:
@@ -213,9 +172,10 @@ def test_a_plot() -> None:
 
 
 def test_plots_take_only_what_they_can_draw() -> None:
-    with pytest.raises(ValueError, match="1 values for 2 places"):
-        Plot("p", "t", ("x", "y"), (Series("s", (1.0,)),), "CD")
-    with pytest.raises(ValueError, match="numbers > 0"):
-        Plot("p", "t", ("x",), (Series("s", (0.0,)),), "CD")
-    with pytest.raises(ValueError, match="no values"):
-        to_svg(Plot("p", "t", ("x",), (Series("s", (None,)),), "CD"))
+    for places, value, message in (
+        (("x", "y"), 1.0, "1 values for 2"),
+        (("x",), 0.0, "> 0"),
+        (("x",), None, "no values"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            to_svg(Plot("p", "t", places, (Series("s", (value,)),), "CD"))

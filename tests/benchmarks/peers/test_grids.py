@@ -11,15 +11,6 @@ from mplicits.neural_fields import Field, Plane, Sphere, Torus, extract_mesh, sp
 from mplicits.neural_fields.networks.grids import spatial_hash
 from mplicits.pipelines.training.trainer import Progress
 from scipy.interpolate import RegularGridInterpolator
-
-# The contract, over a cascade in place of the fields of the common table, whose levels are nested in bands.
-from test_field_contract import (  # noqa: F401
-    test_jet_agrees_with_value_and_autograd,
-    test_levels_count_from_both_ends_and_stop_there,
-    test_results_without_a_graph_are_the_same,
-    test_shapes_and_types_follow_the_input,
-    test_wrong_dimension_is_refused,
-)
 from torch import Tensor
 
 from benchmarks.paper.grids import BanfRecipe, InstantNgpRecipe
@@ -27,39 +18,16 @@ from benchmarks.paper.recipe import Recipe, SignedPools, differences, stencil
 from benchmarks.peers import BandLimited, BanfSDF, HashGridSDF
 
 
-def three_grids() -> Field:
-    return BanfSDF([Torus(), HashGridSDF(levels=2, coarsest=2, finest=8, width=8), Sphere()], [4, 8, 16])
-
-
-@pytest.fixture
-def make() -> Callable[[], Field]:
-    return three_grids
-
-
-@pytest.fixture
-def field(make: Callable[[], Field], dtype: torch.dtype, device: torch.device) -> Field:
-    return make().to(device=device, dtype=dtype)
-
-
 def reads_its_table(*, table_size: int, resolution: int) -> HashGridSDF:
     """One grid with one number per entry, and a network that hands it on: relu(t) − relu(−t)."""
-    field = HashGridSDF(
-        levels=1,
-        table_size=table_size,
-        features=1,
-        coarsest=resolution,
-        finest=resolution,
-        width=2,
-        depth=1,
-        extent=1.0,
-    ).double()
-    with torch.no_grad():
-        field.tables[0].uniform_(-1, 1)
-        hidden, last = field.linear()
-        hidden.weight.copy_(torch.tensor([[1.0], [-1.0]]))
-        last.weight.copy_(torch.tensor([[1.0, -1.0]]))
-        hidden.bias.zero_()
-        last.bias.zero_()
+    sizes = {"levels": 1, "features": 1, "coarsest": resolution, "finest": resolution, "width": 2, "depth": 1}
+    field = HashGridSDF(**sizes, table_size=table_size, extent=1.0).double().requires_grad_(False)
+    field.tables[0].uniform_(-1, 1)
+    hidden, last = field.linear()
+    hidden.weight.copy_(torch.tensor([[1.0], [-1.0]]))
+    last.weight.copy_(torch.tensor([[1.0, -1.0]]))
+    hidden.bias.zero_()
+    last.bias.zero_()
     return field
 
 
@@ -72,8 +40,7 @@ def lattice(resolution: int) -> Tensor:
 def test_dense_grid_reproduces_a_linear_function_and_its_gradient() -> None:
     field = reads_its_table(table_size=128, resolution=4)
     slope = torch.tensor([0.3, -0.7, 0.5], dtype=torch.float64)
-    with torch.no_grad():
-        field.tables[0].copy_((lattice(4).reshape(-1, 3) @ slope + 0.2)[:, None])
+    field.tables[0].copy_((lattice(4).reshape(-1, 3) @ slope + 0.2)[:, None])
     x = 2 * torch.rand(500, 3, dtype=torch.float64) - 1
     jet = field.jet(x)
     torch.testing.assert_close(jet.value, x @ slope + 0.2)
@@ -83,7 +50,6 @@ def test_dense_grid_reproduces_a_linear_function_and_its_gradient() -> None:
 def test_hashed_vertices_show_their_entries() -> None:
     """Small tables cannot hold a grid: then the value at a vertex is the entry that the hash says."""
     field = reads_its_table(table_size=64, resolution=10)
-    assert field.tables[0].shape == (64, 1)
     index = torch.randint(0, 11, (200, 3))
     value = field.value(index.double() / 5 - 1)
     torch.testing.assert_close(value, field.tables[0][spatial_hash(*index.unbind(dim=1), 64), 0])
@@ -98,10 +64,9 @@ def test_outside_the_cube_the_nearest_point_counts() -> None:
 
 
 def test_hash_grid_may_begin_as_a_sphere() -> None:
-    field = HashGridSDF(levels=2, finest=32, radius=0.5)
-    with torch.no_grad():
-        for parameter in field.parameters():
-            parameter.zero_()
+    field = HashGridSDF(levels=2, finest=32, radius=0.5).requires_grad_(False)
+    for parameter in field.parameters():
+        parameter.zero_()
     x = torch.randn(100, 3)
     jet, exact = field.jet(x), Sphere(radius=0.5).jet(x)
     torch.testing.assert_close(jet.value, exact.value)
@@ -148,12 +113,11 @@ def test_cascade_adds_up() -> None:
 @pytest.mark.parametrize(("level", "radius"), [(0, 0.4), (1, 0.7)])
 def test_cascade_is_meshed_and_traced_at_every_level(level: int, radius: float) -> None:
     """The second level moves the surface by far more than a cell: no consumer may trust the first one."""
-    shrunk = HashGridSDF(levels=1, coarsest=2, finest=2, width=1)
-    with torch.no_grad():
-        for parameter in shrunk.parameters():
-            parameter.zero_()
-        shrunk.linear()[-1].bias.fill_(-0.3)
-    cascade = BanfSDF([Sphere(radius=0.4), shrunk], [64, 2]).requires_grad_(False)
+    shrunk = HashGridSDF(levels=1, coarsest=2, finest=2, width=1).requires_grad_(False)
+    for parameter in shrunk.parameters():
+        parameter.zero_()
+    shrunk.linear()[-1].bias.fill_(-0.3)
+    cascade = BanfSDF([Sphere(radius=0.4), shrunk], [64, 2])
     lengths = torch.from_numpy(extract_mesh(cascade, resolution=32, level=level).vertices).norm(dim=1)
     torch.testing.assert_close(lengths, torch.full_like(lengths, radius), atol=1e-3, rtol=0)
     hits = sphere_trace(cascade, torch.tensor([0.0, 0.0, -2.0]), torch.tensor([0.0, 0.0, 1.0]), level=level)
@@ -162,17 +126,10 @@ def test_cascade_is_meshed_and_traced_at_every_level(level: int, radius: float) 
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"levels": 0}, "levels=0"),
-        ({"table_size": 100}, "table_size=100: expected a power of two"),
-        ({"coarsest": 32, "finest": 16}, "coarsest=32, finest=16"),
-        ({"extent": 0.0}, "extent=0"),
-        ({"width": 0}, "width=0"),
-    ],
+    "options", [{"levels": 0}, {"table_size": 100}, {"coarsest": 32, "finest": 16}, {"extent": 0.0}, {"width": 0}]
 )
-def test_impossible_grids_are_refused(options: dict[str, int], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+def test_impossible_grids_are_refused(options: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
         HashGridSDF(**options)
 
 
@@ -194,16 +151,15 @@ def test_pools_hold_signed_distances_of_a_sphere() -> None:
     points, distance = pools.draw(800, (4, 3, 1))
     assert points.shape == (800, 3)
     assert int((distance == 0).sum()) == 400
-    assert bool((points.abs() <= 1.05).all())
+    assert float(points.abs().max()) <= 1.05
     exact = points.norm(dim=1) - 1
     assert float((distance - exact).abs().mean()) < 1e-3
     assert bool((distance[exact.abs() > 0.05].sign() == exact[exact.abs() > 0.05].sign()).all())
 
 
-RECIPES = (InstantNgpRecipe("coarse"), InstantNgpRecipe("fine"), BanfRecipe())
-
-
-@pytest.mark.parametrize("recipe", RECIPES, ids=lambda recipe: recipe.name)
+@pytest.mark.parametrize(
+    "recipe", [InstantNgpRecipe("coarse"), InstantNgpRecipe("fine"), BanfRecipe()], ids=lambda recipe: recipe.name
+)
 def test_recipe_finds_a_sphere(recipe: Recipe) -> None:
     cloud = prepare_cloud(sample_sphere(2000, radius=3.0))
     reports: list[Progress] = []

@@ -7,33 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from benches import SMALL
 from mplicits.datasets import read_cloud
 from mplicits.datasets.synthetic.prisms import PRISMS
-from mplicits.neural_fields import Mesh, MultiscaleSDF, Similarity, Sphere, Union, extract_mesh
-from mplicits.pipelines.mesh.files import write_mesh
+from mplicits.neural_fields import Mesh, MultiscaleSDF, Sphere, Union, extract_mesh
 from mplicits.pipelines.surface.surface import components, face_normals
-from mplicits.pipelines.training.settings import FitConfig
 
 from benchmarks.harness.report import as_text
 from benchmarks.shapes import fits as module
 from benchmarks.shapes.fits import STEEPEST, FitBench, facing_camera
-
-SMALL = FitConfig(
-    widths=(32, 32),
-    depths=(2, 2),
-    omegas=(10.0, 15.0),
-    steps=(120, 40),
-    learning_rates=(4e-3, 1e-3),
-    batch=1024,
-    samples=10_000,
-)
-
-
-@pytest.fixture(scope="module")
-def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("shapes") / "ball.ply"
-    write_mesh(path, extract_mesh(Sphere(radius=0.7), resolution=40), Similarity((5.0, 0.0, -1.0), 20.0))
-    return path
 
 
 @pytest.mark.slow
@@ -45,18 +27,13 @@ def test_rows_picture_and_table(ball: Path, tmp_path: Path, monkeypatch: pytest.
     assert [row.method for row in rows] == ["level 0", "level 1"]
     assert rows[1].seconds > rows[0].seconds > 0
     for row in rows:
-        assert row.metrics is not None
-        assert row.metrics.iou is not None
         assert row.metrics.iou > 0.95
         assert row.metrics.components == 1
         assert row.metrics.chamfer < 2 * row.metrics.chamfer_floor
     assert (tmp_path / "ball.png").stat().st_size > 1000
     table = as_text(*bench.tables(rows, sgemm=1e9))
     finest = rows[1].metrics
-    assert finest is not None
-    assert finest.chamfer_floor is not None
-    assert f"{finest.chamfer:.2e}" in table
-    assert f"{finest.chamfer - finest.chamfer_floor:.2e}" in table
+    assert all(f"{figure:.2e}" in table for figure in (finest.chamfer, finest.chamfer - finest.chamfer_floor))
 
 
 def test_blobs_go_as_mplicits_mesh_drops_them(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,9 +45,7 @@ def test_blobs_go_as_mplicits_mesh_drops_them(ball: Path, tmp_path: Path, monkey
 
     monkeypatch.setattr(module, "extract_mesh", with_blob)
     for kept, parts in ((replace(run, directory=None), 2), (run, 1)):
-        mesh, _ = module.timed_mesh(kept, 64, level=0)
-        assert mesh is not None
-        assert components(mesh) == parts
+        assert components(module.timed_mesh(kept, 64, level=0)[0]) == parts
 
 
 def test_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,22 +64,15 @@ def test_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.M
     assert 0.9 * 0.01 * diagonal < seen[1] < 1.01 * 0.01 * diagonal + 0.02
 
 
-def test_poisson_has_normals_of_its_own_where_ours_are_estimated(ball: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("normals", "methods"),
+    [("auto", ["screened Poisson"]), ("estimate", ["screened Poisson", "screened Poisson, MeshLab's normals"])],
+)
+def test_screened_poisson_when_installed(ball: Path, tmp_path: Path, normals: str, methods: list[str]) -> None:
     pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
-    config = replace(SMALL, normals="estimate")
+    config = replace(SMALL, normals=normals)
     rows = FitBench(shapes=[ball], config=config, resolution=32, samples=5000, poisson_depth=6).rows(tmp_path)
-    assert [row.method for row in rows[2:]] == ["screened Poisson", "screened Poisson, MeshLab's normals"]
-    assert rows[-1].metrics is not None
-    assert rows[-1].metrics.iou is not None
-    assert rows[-1].metrics.iou > 0.95
-
-
-def test_screened_poisson_when_installed(ball: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
-    rows = FitBench(shapes=[ball], config=SMALL, resolution=32, samples=5000, poisson_depth=6).rows(tmp_path)
-    assert [row.method for row in rows] == ["level 0", "level 1", "screened Poisson"]
-    assert rows[-1].metrics is not None
-    assert rows[-1].metrics.iou is not None
+    assert [row.method for row in rows] == ["level 0", "level 1", *methods]
     assert rows[-1].metrics.iou > 0.95
 
 

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mplicits.datasets import OrientedCloud, PointCloud
-from mplicits.neural_fields import Similarity, Sphere, extract_mesh
+from mplicits.datasets.clouds.point_cloud import unit_rows
 from mplicits.pipelines.fit.train import prepare
 from mplicits.pipelines.fit.unoriented import SIGNING
-from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.training.settings import FitConfig
 
 from benchmarks.harness.report import as_text
@@ -19,12 +18,10 @@ from benchmarks.shapes.signs import SignsBench
 CONFIG = FitConfig(widths=(32, 32), depths=(2, 2), omegas=(20.0, 20.0), steps=(1, 1), learning_rates=(3e-3, 1e-3))
 
 
-@pytest.fixture
-def ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(autouse=True)
+def _few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, less in (("steps", 150), ("batch", 1024), ("samples", 10_000)):
         monkeypatch.setitem(vars(SIGNING), name, less)
-    write_mesh(tmp_path / "ball.ply", extract_mesh(Sphere(radius=0.7), resolution=32), Similarity((5.0, 0, -1), 20.0))
-    return tmp_path / "ball.ply"
 
 
 @pytest.mark.parametrize(("noise", "points"), [(0.0, None), (0.005, 2000)])
@@ -39,7 +36,6 @@ def test_a_ball_has_no_wrong_signs(ball: Path, tmp_path: Path, noise: float, poi
 
 @pytest.mark.slow
 def test_normals_that_point_inward_are_counted(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of each point's own: a third is turned round, and the network turns it back."""
 
     def spoilt(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
         good = prepare(cloud, config)
@@ -51,17 +47,15 @@ def test_normals_that_point_inward_are_counted(ball: Path, tmp_path: Path, monke
     assert row.after == 0.0
 
 
-def test_points_that_smoothing_drops_do_not_mix_up_the_others(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_that_smoothing_drops_do_not_mix_up_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every point has another normal here, so that one that is taken for its neighbour shows."""
-    points = np.random.default_rng(0).normal(size=(500, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points = unit_rows(np.random.default_rng(0).normal(size=(500, 3)))
     clean = PointCloud(points, points.astype(np.float32), None, "ball")
     still = prepare(clean, CONFIG)
     left = np.arange(500) % 50 > 0
     moved = (still.points + 0.01 * np.random.default_rng(1).normal(size=(500, 3))).astype(np.float32)[left]
-    smoothed = replace(
-        still, points=moved, normals=still.normals[left], report=replace(still.report, smoothed_noise=1.0)
-    )
+    report = replace(still.report, smoothed_noise=1.0)
+    smoothed = replace(still, points=moved, normals=still.normals[left], report=report)
     monkeypatch.setattr(module, "prepare", lambda *_: still)
     exact = module._exact_normals(clean, clean, smoothed, CONFIG)
     assert (exact == clean.normals[left]).mean() > 0.99  # but for two that lie closer together than they were moved

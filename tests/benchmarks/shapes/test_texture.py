@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from mplicits.datasets import Camera, TexturedMesh, linear_to_srgb, look_at, srgb_to_linear
+from evolutions import fails
+from mplicits.datasets import TexturedMesh, look_at, srgb_to_linear
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.trace import Seen
 from mplicits.pipelines.training.settings import FitConfig, TextureConfig
@@ -20,60 +22,21 @@ from benchmarks.shapes import texture as bench_texture_fits
 from benchmarks.shapes.compare import Drawing, draw, image_error, psnr
 from benchmarks.shapes.texture import PAPER_MSE, TextureBench, TextureRow
 
-CORNERS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
-FILLING = 2 * math.degrees(math.atan(1 / 3))  # the angle at which the square just fills an image from 3 away
-
-
-def square(image: np.ndarray, corners: np.ndarray = CORNERS) -> TexturedMesh:
-    """A square with the whole image on it."""
-    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])[TRIANGLES]
-    return TexturedMesh(corners, TRIANGLES, uv, image.astype(np.float32))
-
-
-def front(pixels: int, z: float = 3.0) -> Camera:
-    return look_at((0.0, 0.0, z), (0.0, 0.0, 0.0), fov=FILLING, width=pixels, height=pixels)
-
-
-def ramp(size: int) -> np.ndarray:
-    """An image whose red, in linear light, is u, and whose green is v."""
-    middle = (np.arange(size) + 0.5) / size
-    light = np.stack((*np.meshgrid(middle, middle[::-1]), np.full((size, size), 0.5)), axis=2)
-    return linear_to_srgb(light)
-
 
 def test_a_square_seen_from_the_front_is_its_image():
     image = np.random.default_rng(0).random((8, 8, 3))
-    seen = mesh_view(square(image), front(8))
+    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    square = TexturedMesh(corners, triangles, (corners[triangles][..., :2] + 1) / 2, image.astype(np.float32))
+    fov = 2 * math.degrees(math.atan(1 / 3))  # the square just fills the picture
+    camera = look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), fov=fov, width=8, height=8)
+    seen = mesh_view(square, camera)
     assert seen.pixel.tolist() == list(range(64))
-    assert seen.color is not None
     np.testing.assert_allclose(seen.color.numpy().reshape(8, 8, 3), image, atol=1e-6)
     np.testing.assert_allclose(seen.normal.numpy(), np.tile([0.0, 0.0, 1.0], (64, 1)), atol=1e-6)
-    _, directions = front(8).rays()
-    torch.testing.assert_close(seen.direction, directions.reshape(-1, 3))
-    torch.testing.assert_close(seen.depth, -3 / directions.reshape(-1, 3)[:, 2])
-
-
-def test_between_texels_light_is_interpolated_linearly():
-    image = np.random.default_rng(1).random((4, 4, 3)).astype(np.float32)
-    seen = mesh_view(square(image), front(8))
-    assert seen.color is not None
-    shown = seen.color.numpy().reshape(8, 8, 3)
-    light = srgb_to_linear(image)
-    # The centre of pixel (2, 3) is a quarter of a texel above texel row 1 and to the right of texel column 1.
-    expected = (
-        0.75 * 0.75 * light[1, 1] + 0.25 * 0.75 * light[0, 1] + 0.75 * 0.25 * light[1, 2] + 0.25 * 0.25 * light[0, 2]
-    )
-    np.testing.assert_allclose(srgb_to_linear(shown)[2, 3], expected, atol=1e-5)
-
-
-def test_map_coordinates_lose_nothing():
-    away = np.array([400_000.0, 5_600_000.0, 100.0])
-    near = mesh_view(square(ramp(32)), front(24))
-    camera = look_at(away + np.array([0.0, 0.0, 3.0]), away, fov=FILLING, width=24, height=24)
-    far = mesh_view(square(ramp(32), CORNERS + away), camera)
-    torch.testing.assert_close(far.color, near.color, atol=1e-4, rtol=0)
-    torch.testing.assert_close(far.depth, near.depth, atol=1e-5, rtol=0)
+    directions = camera.rays()[1].reshape(-1, 3)
+    torch.testing.assert_close(seen.direction, directions)
+    torch.testing.assert_close(seen.depth, -3 / directions[:, 2])
 
 
 def seen_at(pixels: list[int], size: tuple[int, int]) -> Seen:
@@ -87,7 +50,7 @@ def test_drawings_are_averaged_in_linear_light():
     assert drawing.coverage.tolist() == [[0.5, 1.0]]
     quarters = srgb_to_linear(drawing.rgb.astype(np.float64))
     np.testing.assert_allclose(quarters, [[[0.75] * 3, [0.5] * 3]], atol=1e-6)
-    with pytest.raises(ValueError, match="samples=3: expected a divisor of both sides of a 4 × 2 image"):
+    with pytest.raises(ValueError, match="samples=3"):
         draw(seen_at([0], (4, 2)), torch.zeros(1, 3), samples=3)
 
 
@@ -97,8 +60,7 @@ def test_errors_of_images():
     coverage = np.zeros((4, 5), np.float32)
     coverage[1:3, 1:4] = 1
     same = image_error([(Drawing(rgb, coverage), Drawing(rgb, coverage))])
-    assert (same.everywhere, same.either, same.both) == (0, 0, 0)
-    assert (same.pixels_either, same.pixels_both) == (6, 6)
+    assert (same.everywhere, same.either, same.both, same.pixels_either, same.pixels_both) == (0, 0, 0, 6, 6)
     assert psnr(same.both) == 120
     # A quarter more inside, and half on one pixel that only the second image sees a part of.
     other, wider = rgb.copy(), coverage.copy()
@@ -106,9 +68,8 @@ def test_errors_of_images():
     other[0, 0] += 0.5
     wider[0, 0] = 0.3
     error = image_error([(Drawing(rgb, coverage), Drawing(other, wider))])
-    assert error.both == pytest.approx(0.0625)
-    assert error.either == pytest.approx((6 * 0.0625 + 0.25) / 7)
-    assert error.everywhere == pytest.approx((6 * 0.0625 + 0.25) / 20)
+    total = 6 * 0.0625 + 0.25
+    assert (error.both, error.either, error.everywhere) == pytest.approx((0.0625, total / 7, total / 20))
     assert (error.pixels_either, error.pixels_both) == (7, 6)
     assert psnr(0.01) == pytest.approx(20)
     # Two cameras: every pixel counts the same.
@@ -121,24 +82,23 @@ def test_errors_of_images():
 COARSE = FitConfig(
     widths=(24,), depths=(1,), omegas=(8.0,), steps=(150,), learning_rates=(1e-2,), batch=1024, samples=8000
 )
-FULL = FitConfig(
-    widths=(24, 24),
-    depths=(1, 1),
-    omegas=(8.0, 10.0),
-    steps=(150, 30),
-    learning_rates=(1e-2, 1e-3),
-    batch=1024,
-    samples=8000,
-)
+FINE = {"widths": (24, 24), "depths": (1, 1), "omegas": (8.0, 10.0), "steps": (150, 30), "learning_rates": (1e-2, 1e-3)}
+FULL = replace(COARSE, **FINE)
 SMALL = TextureConfig(
     width=32, depth=2, omega=12.0, steps=150, learning_rate=4e-3, batch=1024, band_batch=256, samples=8000
 )
-VIEW = {"views": 2, "size": 48, "resolution": 48}
 
 
 def of(*meshes: Path, **options: object) -> TextureBench:
-    given = {"texture": SMALL, "coarse": COARSE, "device": "cpu", **VIEW, **options}
-    return TextureBench(meshes=meshes, **given)  # type: ignore[arg-type]
+    given = {"texture": SMALL, "coarse": COARSE, "device": "cpu", "views": 2, "size": 48, "resolution": 48}
+    return TextureBench(meshes=meshes, **(given | options))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_points():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
+        yield
 
 
 def write_ball(folder: Path, *, image: np.ndarray | None = None) -> Path:
@@ -162,9 +122,7 @@ def write_ball(folder: Path, *, image: np.ndarray | None = None) -> Path:
 def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, list[TextureRow]]:
     folder = tmp_path_factory.mktemp("ball")
     path, out = write_ball(folder), folder / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
-        return path, out, of(path, full=FULL).rows(out)
+    return path, out, of(path, full=FULL).rows(out)
 
 
 def test_rows_errors_and_sheet(bench):
@@ -182,15 +140,13 @@ def test_rows_errors_and_sheet(bench):
         assert 0.4 * 2 * 48**2 < row.error.pixels_both < row.error.pixels_either < 0.8 * 2 * 48**2
         assert row.error.everywhere == pytest.approx(row.error.either * row.error.pixels_either / (2 * 48**2))
         assert min(row.fit_seconds, row.texture_seconds) > 0
-    assert (rows[0].parameters, rows[0].texture_parameters) == (24 * 3 + 24 + 24 + 1, 32 * 3 + 32 + 33 * 32 + 33 * 3)
     # The mesh of a surface shows what its trace does.
     assert rows[2].error.both == pytest.approx(rows[0].error.both, rel=0.1)
     sheet = iio.imread(out / "spot.png")
     assert sheet.shape == (2 * (48 + 40), 5 * (48 + 12), 3)
 
 
-def test_what_is_there_is_used_and_what_is_not_is_trained(bench, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
+def test_what_is_there_is_used_and_what_is_not_is_trained(bench, tmp_path):
     path, out, rows = bench
     runs = sorted((out / "runs").iterdir())
     assert len(runs) == 2
@@ -209,26 +165,23 @@ def test_what_is_there_is_used_and_what_is_not_is_trained(bench, tmp_path, monke
     changed = [file for file, then in zip(files, before, strict=True) if file.stat().st_mtime_ns != then]
     assert changed == [coarse / "texture.safetensors"]
     # Other settings, or an image of another mesh beside the same OBJ file, are other fits.
-    kept = {part.name: of(path).settings(part) for part in of(path).cells()}
-    assert kept != {part.name: of(path, coarse=FULL).settings(part) for part in of(path).cells()}
+    part = of(path).cells()[0]
+    assert of(path).settings(part) != of(path, coarse=FULL).settings(part)
     painted = write_ball(tmp_path, image=np.full((4, 4, 3), 0.5))
     assert painted.read_bytes() == path.read_bytes()
-    assert of(painted).cells()[0].options != of(path).cells()[0].options
+    assert of(painted).cells()[0].options != part.options
 
 
 def test_the_command(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(bench_shapes, "COARSE", COARSE)
-    monkeypatch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
-    path = write_ball(tmp_path)
-    settings = "--coarse-width 16 --coarse-omega 6 --coarse-steps 60"
-    settings += " --width 16 --depth 1 --steps 20 --samples 2000 --batch 512"
-    view = "--views 1 --size 32 --resolution 32 --json"
-    command = ["texture", str(path), "-o", str(tmp_path / "out"), *settings.split(), *view.split()]
-    assert main([*command, str(tmp_path / "figures.json")]) == 0
+    figures = tmp_path / "figures.json"
+    command = f"texture {write_ball(tmp_path)} -o {tmp_path / 'out'} --json {figures} --coarse-width 16"
+    command += " --coarse-omega 6 --coarse-steps 60 --width 16 --depth 1 --steps 20 --samples 2000 --batch 512"
+    command += " --views 1 --size 32 --resolution 32"
+    assert main(command.split()) == 0
     assert "spot (16,1) mesh" in capsys.readouterr().out
-    figures = json.loads((tmp_path / "figures.json").read_text())["records"][0]["outputs"]
-    assert [row["surface"] for row in figures] == ["(16,1) traced", "(16,1) mesh"]
-    assert figures[0]["error"]["either"] < 0.2
+    rows = json.loads(figures.read_text())["records"][0]["outputs"]
+    assert [row["surface"] for row in rows] == ["(16,1) traced", "(16,1) mesh"]
+    assert rows[0]["error"]["either"] < 0.2
     (tmp_path / "spot.obj").unlink()
-    assert main([*command, str(tmp_path / "figures.json")]) == 2
-    assert "spot.obj: no such file" in capsys.readouterr().err
+    assert "spot.obj: no such file" in fails(capsys, command, main)

@@ -1,5 +1,3 @@
-"""Clouds whose density varies: how many points, how much it varies, and where they lie."""
-
 import numpy as np
 import pytest
 from mplicits.neural_fields import Box, extract_mesh
@@ -13,7 +11,6 @@ def test_spacings_differ_by_the_root_of_the_ratio_of_densities(density: str) -> 
     mesh = extract_mesh(Box(half_size=(0.6, 0.4, 0.2)), resolution=48)
     cloud = uneven_cloud(mesh, 2000, density=density, ratio=25.0, seed=1)
     assert 0.8 * 2000 <= len(cloud) <= 2000
-    assert cloud.normals is not None
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-5)
     # A voxel has one point: neighbours are some 0.5 to 1.5 of its edge apart, whose largest is 5 times the least.
     spacing = KDTree(cloud.points).query(cloud.points, 5)[0][:, 4]

@@ -7,12 +7,10 @@ from mplicits.datasets.depth.cleaning import joint_bilateral, smooth_depth
 
 
 def table_bound(guide: np.ndarray, image: np.ndarray, size: int) -> float:
-    """A bound of OpenCV's error: h²/8 in each weight of interpolating exp(-t²/2) in a table of 4096 entries a channel.
-
-    A mean changes by less than twice the changes of its weights, times the largest value; the weights sum to 1 or more.
-    """
+    """OpenCV's error at most: h²/8 in each weight, by interpolating exp(-t²/2) in a table of 4096 entries a channel."""
     step = float(np.ptp(guide, axis=(0, 1)).sum()) / (4096 * guide.shape[2])
     weight = step**2 / 8 + 16 * float(np.finfo(np.float32).eps)
+    # A mean changes by less than twice the changes of its weights, which sum to 1 or more, times the largest value.
     return 2 * size**2 * weight * float(np.abs(image).max())
 
 

@@ -5,18 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import (
-    STATUE_PLACEMENT,
-    Statue,
-    add_isotropic_noise,
-    add_noise,
-    add_outliers,
-    prepare_cloud,
-    sample_sphere,
-    sample_surface,
-    sample_torus,
-    statue_scan,
-)
+from mplicits import datasets
+from mplicits.datasets import Statue, add_isotropic_noise, add_noise, sample_sphere, sample_surface, sample_torus
 from mplicits.neural_fields import Box, Capsule, Sphere, Torus
 from scipy.ndimage import label
 from scipy.spatial import KDTree
@@ -76,7 +66,7 @@ def test_isotropic_noise_is_as_strong_along_the_normals_and_across():
 
 def test_outliers_fill_the_ball():
     cloud = sample_sphere(20000, radius=2.0)
-    dirty = add_outliers(cloud, 0.5, seed=1)
+    dirty = datasets.add_outliers(cloud, 0.5, seed=1)
     assert len(dirty) == 30000
     assert np.array_equal(dirty.points[:20000], cloud.points)
     radii = np.linalg.norm(dirty.points[20000:], axis=1) / 2
@@ -113,15 +103,15 @@ def test_statue_is_one_solid_inside_the_unit_sphere(statue):
 
 @pytest.mark.slow
 def test_statue_scan(statue):
-    scan = statue_scan(seed=0)
+    scan = datasets.statue_scan(seed=0)
     assert 60_000 < len(scan) < 120_000
     assert scan.colors is not None
     assert scan.points.max() > 1000  # millimetres in a hall, not the unit sphere
-    jet = statue.jet(torch.from_numpy(STATUE_PLACEMENT.to_unit(scan.points[::300])))
+    jet = statue.jet(torch.from_numpy(datasets.STATUE_PLACEMENT.to_unit(scan.points[::300])))
     distance = (jet.value / jet.gradient.norm(dim=1)).numpy()  # to first order
     assert np.abs(distance).max() < 6 * 2e-4
     assert 1e-4 < distance.std() < 2e-4  # the ranges' noise is 2e-4, along rays that meet the surface at up to 84°
-    cloud = prepare_cloud(scan)
+    cloud = datasets.prepare_cloud(scan)
     assert cloud.report.repaired_normals > 100
     assert cloud.report.kept > 0.995 * len(scan)
     assert not cloud.report.flipped

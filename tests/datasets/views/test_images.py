@@ -2,16 +2,18 @@
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from mplicits.datasets import Camera, PosedImages, linear_to_srgb, look_at, read_posed_images, srgb_to_linear
-from mplicits.neural_fields import InputError, Similarity
-from scipy.spatial.transform import Rotation
+from mplicits.neural_fields import Similarity
+from photographs import changed_transforms, colmap_pose, project_by_opencv, projections, same_cameras, transforms
+from photographs import write_image as write
+from refusals import refused
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 6
 CENTER, RADIUS = np.array([0.3, -0.2, 0.1]), 0.7
@@ -19,7 +21,6 @@ LENS = {"k1": -0.2, "k2": 0.05, "p1": 0.002, "p2": -0.001}
 
 
 def cameras() -> list[Camera]:
-    """All around the ball, with an axis away from the middle."""
     intrinsics = torch.tensor([[60.0, 0, 24.5], [0, 58.0, 17.0], [0, 0, 1]], dtype=torch.float64)
     turns = 2 * np.pi * np.arange(VIEWS) / VIEWS
     eyes = CENTER + 3 * np.stack((np.cos(turns), 0.5 * (-1.0) ** np.arange(VIEWS), np.sin(turns)), axis=1)
@@ -37,47 +38,41 @@ def picture(index: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> np.ndarray:
     return np.random.default_rng(index).integers(0, 256, (size[1], size[0], 3), np.uint8)
 
 
-def write(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(path, image)
+def white_inside(mask: np.ndarray) -> np.ndarray:
+    return mask.astype(np.uint8) * 255
+
+
+def write_masks(
+    folder: Path, name: str = "{:03d}.png", make: Callable[[np.ndarray], np.ndarray] = white_inside
+) -> None:
+    for index, camera in enumerate(cameras()):
+        write(folder / name.format(index), make(silhouette(camera)))
 
 
 def write_neus(folder: Path, *, scale: np.ndarray | None = None, masks: bool = True, **changes: np.ndarray) -> Path:
-    arrays = {}
-    for index, camera in enumerate(cameras()):
-        projection = torch.eye(4, dtype=torch.float64)
-        projection[:3] = camera.intrinsics @ torch.linalg.inv(camera.world_from_camera)[:3]
-        arrays[f"world_mat_{index}"] = projection.numpy()
-        if scale is not None:
-            arrays[f"scale_mat_{index}"] = scale
+    scales = {} if scale is None else {f"scale_mat_{index}": scale for index in range(VIEWS)}
+    for index in range(VIEWS):
         write(folder / "image" / f"{index:03d}.png", picture(index))
-        if masks:
-            write(folder / "mask" / f"{index:03d}.png", silhouette(camera).astype(np.uint8) * 255)
-    np.savez(folder / "cameras_sphere.npz", **{**arrays, **changes})
+    if masks:
+        write_masks(folder / "mask")
+    np.savez(folder / "cameras_sphere.npz", **projections(cameras()), **(scales | changes))
     return folder
 
 
-def write_transforms(folder: Path, size: tuple[int, int] | None = None, **shared: object) -> Path:
-    frames = []
-    for index, camera in enumerate(cameras()):
-        columns = (camera.right, -camera.down, -camera.forward, camera.eye)
-        pose = [*torch.stack(columns, dim=1).tolist(), [0.0, 0.0, 0.0, 1.0]]
-        frames.append({"file_path": f"images/{index}.png", "transform_matrix": pose})
-        write(folder / "images" / f"{index}.png", picture(index, size or (WIDTH, HEIGHT)))
+def write_transforms(folder: Path, size: tuple[int, int] = (WIDTH, HEIGHT), **shared: object) -> Path:
+    for index in range(VIEWS):
+        write(folder / "images" / f"{index}.png", picture(index, size))
     lens = {"fl_x": 60.0, "fl_y": 58.0, "cx": 25.0, "cy": 17.5, "w": WIDTH, "h": HEIGHT}
-    (folder / "transforms.json").write_text(json.dumps({**lens, **shared, "frames": frames}))
+    (folder / "transforms.json").write_text(json.dumps(transforms(cameras(), **lens, **shared)))
     return folder
 
 
 def write_colmap(folder: Path, points: np.ndarray | None = None) -> Path:
-    model = folder / "sparse" / "0"
+    model, lines = folder / "sparse" / "0", ""
     model.mkdir(parents=True)
     (model / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} 60 58 25 17.5\n")
-    lines = ""
     for index, camera in enumerate(cameras()):
-        seen = torch.linalg.inv(camera.world_from_camera).numpy()
-        x, y, z, w = Rotation.from_matrix(seen[:3, :3]).as_quat().tolist()
-        lines += f"{index} {w} {x} {y} {z} {' '.join(map(str, seen[:3, 3]))} 1 {index}.png\n\n"
+        lines += f"{index} {' '.join(map(str, colmap_pose(camera)))} 1 {index}.png\n\n"
         write(folder / "images" / f"{index}.png", picture(index))
     (model / "images.txt").write_text(lines)
     if points is not None:
@@ -92,13 +87,10 @@ def sphere_points() -> np.ndarray:
 
 
 def assert_as_written(read: PosedImages) -> None:
-    assert len(read.views) == VIEWS
-    for index, (view, expected) in enumerate(zip(read.views, cameras(), strict=True)):
+    same_cameras([view.camera for view in read.views], cameras())
+    for index, view in enumerate(read.views):
         assert view.color.dtype == np.float32
         np.testing.assert_allclose(view.color, picture(index) / 255, atol=1e-6)
-        assert (view.camera.width, view.camera.height) == (WIDTH, HEIGHT)
-        torch.testing.assert_close(view.camera.intrinsics, expected.intrinsics)
-        torch.testing.assert_close(view.camera.world_from_camera, expected.world_from_camera, rtol=0, atol=1e-9)
 
 
 def test_neus(tmp_path):
@@ -131,7 +123,6 @@ def test_transforms(tmp_path):
 def test_colmap(tmp_path):
     read = read_posed_images(write_colmap(tmp_path, sphere_points()))
     assert_as_written(read)
-    assert read.points is not None
     np.testing.assert_allclose(read.points, sphere_points())
     assert read.region == "sparse points"
     assert np.linalg.norm(np.array(read.similarity.center) - CENTER) < 0.1
@@ -141,8 +132,7 @@ def test_colmap(tmp_path):
 
 def test_the_hull_of_the_masks_goes_before_points_and_both_before_cameras(tmp_path):
     folder = write_colmap(tmp_path, sphere_points() + 0.2)
-    for index, camera in enumerate(cameras()):
-        write(folder / "masks" / f"{index}.png.png", silhouette(camera).astype(np.uint8) * 255)
+    write_masks(folder / "masks", "{}.png.png")
     read = read_posed_images(folder)
     assert read.region == "visual hull of the masks"
     assert np.linalg.norm(np.array(read.similarity.center) - CENTER) < 0.1
@@ -151,37 +141,25 @@ def test_the_hull_of_the_masks_goes_before_points_and_both_before_cameras(tmp_pa
 
 def test_what_could_not_say_where_the_object_is_says_why(tmp_path):
     folder = write_colmap(tmp_path, sphere_points() + 900)
-    for index in range(VIEWS):
-        write(folder / "masks" / f"{index}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    read = read_posed_images(folder)
-    assert read.region.startswith("what the cameras look at; not masks: no part of space is object in enough of them")
-    assert "; not points: 0 of 400 are where most cameras look" in read.region
+    write_masks(folder / "masks", "{}.png", lambda mask: 0 * white_inside(mask))
+    region = read_posed_images(folder).region
+    assert all(said in region for said in ("what the cameras look at", "; not masks: ", "; not points: 0 of 400"))
 
 
 def test_masks_that_are_white_in_all_views_are_none(tmp_path):
     """NeuS wants white masks where there are none, and many programs write pictures with an opaque alpha."""
     folder = write_neus(tmp_path, masks=False)
-    for index in range(VIEWS):
-        write(folder / "mask" / f"{index:03d}.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    write_masks(folder / "mask", make=lambda mask: np.full_like(mask, 255, np.uint8))
     assert all(view.mask is None for view in read_posed_images(folder, width=17).views)
-    write(folder / "mask" / "000.png", silhouette(cameras()[0]).astype(np.uint8) * 255)
+    write(folder / "mask" / "000.png", white_inside(silhouette(cameras()[0])))
     masks = [view.mask for view in read_posed_images(folder).views]
     assert [mask is not None and mask.min() for mask in masks] == [0, 1, 1, 1, 1, 1]
 
 
-def test_a_given_region_goes_before_all(tmp_path):
-    given = Similarity((1.0, 2.0, 3.0), 4.0)
-    read = read_posed_images(write_neus(tmp_path, scale=np.eye(4)), region=given)
-    assert read.similarity is given
-    assert read.region == "given"
-
-
 def test_without_anything_that_cameras_share_the_region_must_be_given(tmp_path):
-    write_transforms(tmp_path)
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    content["frames"] = content["frames"][:1]
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"transforms\.json: region: not found \(cameras: .* parallel"):
+    with changed_transforms(write_transforms(tmp_path)) as content:
+        del content["frames"][1:]
+    with refused(tmp_path / "transforms.json", "region: not found .* parallel"):
         read_posed_images(tmp_path, allow_missing=True)
     assert len(read_posed_images(tmp_path, region=Similarity.identity(), allow_missing=True).views) == 1
 
@@ -191,11 +169,8 @@ def test_distorted_pictures_show_the_world_where_the_new_cameras_have_it(tmp_pat
     write_transforms(tmp_path, **LENS)
     points = torch.tensor(np.stack((CENTER, CENTER + np.array((0.5, 0.35, 0.5)))))
     x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    lens = np.array(list(LENS.values()))
     for index, camera in enumerate(cameras()):
-        seen = torch.linalg.inv(camera.world_from_camera).numpy()
-        turn, _ = cv2.Rodrigues(seen[:3, :3])
-        dots = cv2.projectPoints(points.numpy(), turn, seen[:3, 3], camera.intrinsics.numpy(), lens)[0].reshape(2, 2)
+        dots = project_by_opencv(camera, points, tuple(LENS.values()))
         squares = (x - dots[:, 0, None, None]) ** 2 + (y - dots[:, 1, None, None]) ** 2
         light = np.moveaxis(np.exp(-squares / (2 * 1.3**2)), 0, 2)  # one dot is red, the other green
         light = np.dstack((light, np.zeros((HEIGHT, WIDTH))))
@@ -211,12 +186,12 @@ def test_distorted_pictures_show_the_world_where_the_new_cameras_have_it(tmp_pat
 
 def test_opaque_distortion_needs_opencvs_full_model(tmp_path):
     write_transforms(tmp_path, k1=0.1, k4=0.2)
-    with pytest.raises(InputError, match=r"transforms\.json: k4: 0\.2; expected 0 unless camera_model is FULL_OPENCV"):
+    with refused(tmp_path / "transforms.json", r"k4: 0\.2; .*FULL_OPENCV"):
         read_posed_images(tmp_path)
     read = read_posed_images(write_transforms(tmp_path, k1=0.1, k4=0.2, camera_model="FULL_OPENCV"))
     assert float(read.views[0].camera.intrinsics[0, 0]) != pytest.approx(60.0, abs=0.1)
     write_transforms(tmp_path, k1=-5.0)
-    with pytest.raises(InputError, match=r"frames\[0\]: distortion=\(-5\.0, .*; check the coefficients"):
+    with refused(tmp_path / "transforms.json", r"frames\[0\]: distortion=\(-5\.0"):
         read_posed_images(tmp_path)
 
 
@@ -240,7 +215,6 @@ def test_transparent_pixels_lend_no_colour_to_their_neighbours(tmp_path):
     for index in range(VIEWS):
         write(tmp_path / "images" / f"{index}.png", image)
     view = read_posed_images(tmp_path, region=Similarity.identity()).views[0]
-    assert view.mask is not None
     np.testing.assert_array_equal(view.mask, np.tile([1.0, 0.0], (HEIGHT, WIDTH // 2)))
     view = read_posed_images(tmp_path, width=WIDTH // 2, region=Similarity.identity()).views[0]
     np.testing.assert_allclose(view.mask, 0.5, atol=1e-6)
@@ -250,7 +224,7 @@ def test_transparent_pixels_lend_no_colour_to_their_neighbours(tmp_path):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda mask: mask.astype(np.uint8) * 255,
+        white_inside,
         lambda mask: mask.astype(np.uint8),
         lambda mask: mask.astype(np.uint16) * 65535,
         lambda mask: np.repeat(mask.astype(np.uint8)[..., None], 3, axis=2) * 255,
@@ -258,27 +232,16 @@ def test_transparent_pixels_lend_no_colour_to_their_neighbours(tmp_path):
     ],
 )
 def test_masks_of_any_depth_say_object_above_half(make, tmp_path):
-    write_neus(tmp_path)
-    for index, camera in enumerate(cameras()):
-        write(tmp_path / "mask" / f"{index:03d}.png", make(silhouette(camera)))
+    write_masks(write_neus(tmp_path, masks=False) / "mask", make=make)
     for view, camera in zip(read_posed_images(tmp_path).views, cameras(), strict=True):
         np.testing.assert_array_equal(view.mask, silhouette(camera))
 
 
-def test_pictures_of_16_bits_and_grey_ones(tmp_path):
-    write_neus(tmp_path)
-    write(tmp_path / "image" / "000.png", np.full((HEIGHT, WIDTH), 12345, np.uint16))
-    view = read_posed_images(tmp_path).views[0]
-    np.testing.assert_allclose(view.color, np.full((HEIGHT, WIDTH, 3), 12345 / 65535), atol=1e-6)
-
-
 def test_masks_of_a_transforms_json_are_named_frame_by_frame(tmp_path):
-    write_transforms(tmp_path)
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    for index, (frame, camera) in enumerate(zip(content["frames"], cameras(), strict=True)):
-        frame["mask_path"] = f"m/{index}.png"
-        write(tmp_path / "m" / f"{index}.png", silhouette(camera).astype(np.uint8) * 255)
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    write_masks(tmp_path / "m", "{}.png")
+    with changed_transforms(write_transforms(tmp_path)) as content:
+        for index, frame in enumerate(content["frames"]):
+            frame["mask_path"] = f"m/{index}.png"
     read = read_posed_images(tmp_path)
     assert read.region == "visual hull of the masks"
     np.testing.assert_array_equal(read.views[2].mask, silhouette(cameras()[2]))
@@ -289,7 +252,7 @@ def test_cameras_follow_pictures_of_another_size_but_the_same_shape(tmp_path):
     expected = cameras()[0].resized(WIDTH // 2, HEIGHT // 2)
     torch.testing.assert_close(read.views[0].camera.intrinsics, expected.intrinsics)
     write_transforms(tmp_path, size=(HEIGHT, WIDTH))
-    with pytest.raises(InputError, match=r"0\.png has 36 × 48 pixels, but its camera has 48 × 36; turn, crop"):
+    with refused(tmp_path, r"0\.png has 36 × 48 pixels.* 48 × 36"):
         read_posed_images(tmp_path)
 
 
@@ -298,26 +261,23 @@ def test_missing_files_are_counted_before_anything_is_read(tmp_path):
     for name in ("1", "4"):
         (tmp_path / "images" / f"{name}.png").unlink()
     (tmp_path / "images" / "0.png").write_bytes(b"damaged")
-    message = r"transforms\.json: frames\[1\]: no image .*1\.png \(2 of 6 are missing\); add it, or leave"
-    with pytest.raises(InputError, match=message):
+    with refused(tmp_path / "transforms.json", r"frames\[1\]: no image .*1\.png \(2 of 6"):
         read_posed_images(tmp_path)
 
 
 def test_damaged_pictures_and_masks_of_another_size_are_named(tmp_path):
-    write_neus(tmp_path)
-    write(tmp_path / "mask" / "002.png", np.zeros((HEIGHT, WIDTH + 1), np.uint8))
-    with pytest.raises(InputError, match=r"002\.png: 49 × 36 pixels, but .*002\.png has 48 × 36; make them match"):
+    mask = write_neus(tmp_path) / "mask" / "002.png"
+    write(mask, np.zeros((HEIGHT, WIDTH + 1), np.uint8))
+    with refused(mask, "49 × 36 pixels.* 48 × 36"):
         read_posed_images(tmp_path)
-    (tmp_path / "mask" / "002.png").write_bytes(b"damaged")
-    with pytest.raises(InputError, match=r"mask.002\.png: cannot be decoded as an image"):
+    mask.write_bytes(b"damaged")
+    with refused(mask, "cannot be decoded"):
         read_posed_images(tmp_path)
-    (tmp_path / "mask" / "002.png").unlink()
-    with pytest.raises(InputError, match=r"cameras_sphere\.npz: 6 world_mat_i, but 5 masks in .*mask; make them match"):
+    mask.unlink()
+    with refused(tmp_path / "cameras_sphere.npz", "6 world_mat_i, but 5 masks"):
         read_posed_images(tmp_path)
-    (tmp_path / "images").mkdir()
-    write_colmap(tmp_path / "colmap")
-    write(tmp_path / "colmap" / "masks" / "0.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    with pytest.raises(InputError, match=r"images\.txt: 1\.png: no mask .*1\.png\.png \(5 of 6 are missing\); add it"):
+    write(write_colmap(tmp_path / "colmap") / "masks" / "0.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    with refused("images.txt", r"1\.png: no mask .*1\.png\.png \(5 of 6"):
         read_posed_images(tmp_path / "colmap")
 
 
@@ -333,27 +293,25 @@ def test_damaged_pictures_and_masks_of_another_size_are_named(tmp_path):
 )
 def test_spheres_that_are_none_are_refused(change, message, tmp_path):
     write_neus(tmp_path, scale=np.eye(4), **change)
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(tmp_path / "cameras_sphere.npz", message):
         read_posed_images(tmp_path)
-    assert "\n" not in str(caught.value)
 
 
 def test_what_is_no_data_set_says_what_was_looked_for(tmp_path):
-    with pytest.raises(InputError, match=r"none of cameras_sphere\.npz, .* or a COLMAP model \(sparse/\*\) in it"):
+    with refused(tmp_path, r"none of cameras_sphere\.npz, "):
         read_posed_images(tmp_path)
     with pytest.raises(ValueError, match="width=0: expected at least one pixel"):
         read_posed_images(tmp_path, width=0)
 
 
 def test_photographs_without_a_camera_are_counted(tmp_path):
-    """Two more photographs are said, twenty more are too many, and cameras without a photograph are left out."""
     write_colmap(tmp_path, np.random.default_rng(0).normal(size=(50, 3)) * 0.2 + CENTER)
     for index in range(2):
         write(tmp_path / "images" / f"more{index}.png", picture(0))
     assert read_posed_images(tmp_path).reading == f"{VIEWS} of {VIEWS + 2} photographs have a camera"
     for index in range(20):
         write(tmp_path / "images" / f"more{index}.png", picture(0))
-    with pytest.raises(InputError, match=r"only 6 of 26 photographs have a camera; .*--allow-missing"):
+    with refused(tmp_path, "6 of 26 photographs .*--allow-missing"):
         read_posed_images(tmp_path)
     (tmp_path / "images" / "3.png").unlink()
     read = read_posed_images(tmp_path, allow_missing=True)
@@ -374,13 +332,10 @@ def test_names_that_were_written_on_windows(tmp_path):
 
 @pytest.mark.parametrize("extension", [".tif", ".webp"])
 def test_photographs_of_other_kinds(tmp_path, extension):
-    write_transforms(tmp_path)
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    for index, frame in enumerate(content["frames"]):
-        (tmp_path / frame["file_path"]).unlink()
-        frame["file_path"] = f"images/{index}"  # Blender's leave the extension out
-        image = picture(index)[..., ::-1]
-        data = cv2.imencode(extension, image, [cv2.IMWRITE_WEBP_QUALITY, 101] if extension == ".webp" else [])[1]
-        (tmp_path / "images" / f"{index}{extension}").write_bytes(data.tobytes())
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    lossless = [cv2.IMWRITE_WEBP_QUALITY, 101] if extension == ".webp" else []
+    with changed_transforms(write_transforms(tmp_path)) as content:
+        for index, frame in enumerate(content["frames"]):
+            (tmp_path / frame["file_path"]).unlink()
+            frame["file_path"] = f"images/{index}"  # Blender's leave the extension out
+            cv2.imwrite(str(tmp_path / "images" / f"{index}{extension}"), picture(index)[..., ::-1], lossless)
     assert np.allclose(read_posed_images(tmp_path).views[2].color, picture(2) / 255, atol=1e-6)

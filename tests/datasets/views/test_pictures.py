@@ -1,11 +1,11 @@
 """Undistorted pictures agree with their pinholes, and nothing in them is made up."""
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from mplicits.datasets import Camera, look_at
 from mplicits.datasets.views.images import undistort, undistorted_camera
+from photographs import project_by_opencv
 
 WIDTH, HEIGHT = 160, 120
 LENSES = {
@@ -25,11 +25,7 @@ def camera(*lens: float) -> Camera:
 
 
 def distorted_pixels(camera: Camera, points: torch.Tensor) -> np.ndarray:
-    seen = torch.linalg.inv(camera.world_from_camera)
-    turn, _ = cv2.Rodrigues(seen[:3, :3].numpy())
-    coefficients = np.array((*camera.distortion, *(0.0,) * (8 - len(camera.distortion))))
-    matrix = camera.intrinsics.numpy()
-    return cv2.projectPoints(points.numpy(), turn, seen[:3, 3].numpy(), matrix, coefficients)[0].reshape(-1, 2)
+    return project_by_opencv(camera, points, (*camera.distortion, *(0.0,) * (8 - len(camera.distortion))))
 
 
 def draw(dots: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -68,9 +64,9 @@ def test_the_picture_is_all_seen_and_no_smaller_than_it_must_be(lens):
     assert pinhole.world_from_camera is before.world_from_camera
     # Pictures that hold their own coordinates show from where each pixel was taken.
     x, y = np.meshgrid(np.arange(WIDTH, dtype=np.float32), np.arange(HEIGHT, dtype=np.float32))
-    rays = np.stack(((x - float(pinhole.intrinsics[0, 2])) / float(pinhole.intrinsics[0, 0]),) * 2 + (np.ones_like(x),))
-    rays[1] = (y - float(pinhole.intrinsics[1, 2])) / float(pinhole.intrinsics[1, 1])
-    points = torch.from_numpy(rays.reshape(3, -1).T.astype(np.float64)) @ before.world_from_camera[:3, :3].T
+    fx, fy, cx, cy = pinhole.fx_fy_cx_cy
+    rays = np.stack(((x - cx) / fx, (y - cy) / fy, np.ones_like(x))).reshape(3, -1).T
+    points = torch.from_numpy(rays.astype(np.float64)) @ before.world_from_camera[:3, :3].T
     taken = distorted_pixels(before, points + before.eye)
     assert taken.min() > -0.05
     assert (taken.max(axis=0) < (WIDTH - 0.95, HEIGHT - 0.95)).all()

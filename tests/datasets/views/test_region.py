@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import Camera, look_at
+from mplicits.datasets.clouds.point_cloud import unit_rows
 from mplicits.datasets.views.region import region_from_cameras, region_from_masks, region_from_points
 
 CENTER = np.array([500_000.0, 20.0, -7.0])
@@ -15,18 +16,16 @@ def moved(x: float = 0, y: float = 0, z: float = 0) -> list[float]:
     return (CENTER + np.array((x, y, z))).tolist()
 
 
-def around(count: int = 12, *, distance: float = 5.0, size: tuple[int, int] = (48, 32)) -> list[Camera]:
+def around(count: int = 12, *, size: tuple[int, int] = (48, 32)) -> list[Camera]:
     """Cameras all around CENTER, from above and below, with a vertical angle of 40 degrees."""
     turns = 2 * np.pi * np.arange(count) / count
     heights = 0.6 * np.sin(3 * turns)
     ways = np.stack((np.cos(turns) * np.cos(heights), np.sin(heights), np.sin(turns) * np.cos(heights)), axis=1)
-    eyes = CENTER + distance * ways
-    return [look_at(eye.tolist(), CENTER.tolist(), fov=40, width=size[0], height=size[1]) for eye in eyes]
+    return [look_at(eye.tolist(), moved(), fov=40, width=size[0], height=size[1]) for eye in CENTER + 5 * ways]
 
 
-def ball(radius: float, count: int = 500, seed: int = 0) -> np.ndarray:
-    ways = np.random.default_rng(seed).normal(size=(count, 3))
-    return CENTER + radius * ways / np.linalg.norm(ways, axis=1, keepdims=True)
+def ball() -> np.ndarray:
+    return CENTER + unit_rows(np.random.default_rng(0).normal(size=(500, 3)))
 
 
 def silhouettes(cameras: list[Camera], center: np.ndarray, radius: float) -> list[np.ndarray]:
@@ -54,10 +53,8 @@ def test_the_sphere_holds_no_camera():
 
 def test_the_nearest_point_of_axes_that_do_not_meet():
     """Two skew axes, along x at height 1 and along z at height −1: half-way between them."""
-    cameras = [
-        look_at((-5, 1, 0), (0, 1, 0), width=8, height=8, fov=60),
-        look_at((0, -1, -5), (0, -1, 0), width=8, height=8, fov=60),
-    ]
+    axes = (((-5, 1, 0), (0, 1, 0)), ((0, -1, -5), (0, -1, 0)))
+    cameras = [look_at(eye, target, width=8, height=8, fov=60) for eye, target in axes]
     np.testing.assert_allclose(region_from_cameras(cameras).center, (0, 0, 0), atol=1e-12)
 
 
@@ -80,21 +77,21 @@ def test_sparse_points_on_a_ball_give_it_whatever_is_far_outside():
     rng = np.random.default_rng(1)
     background = CENTER + rng.normal(size=(300, 3)) * 40
     stray = CENTER + np.array([[0.0, 1.7, 0], [1.6, 0, 0], [0, 0, -1.7]])
-    region = region_from_points(np.concatenate((ball(1.0), background, stray)), around())
+    region = region_from_points(np.concatenate((ball(), background, stray)), around())
     assert np.linalg.norm(np.array(region.center) - CENTER) < 0.05
     assert 1.0 < region.scale < 1.15
 
 
 def test_too_few_points_in_view_are_refused():
-    with pytest.raises(ValueError, match=r"points: 0 of 500 are where most cameras look; expected 8"):
-        region_from_points(ball(1.0) + np.array((0, 900, 0)), around())
-    with pytest.raises(ValueError, match="points: all of them coincide"):
-        region_from_points(np.repeat(CENTER[None], 20, axis=0), around())
+    elsewhere = ball() + np.array((0, 900, 0))
+    for points, message in ((elsewhere, "points: 0 of 500"), (np.tile(CENTER, (20, 1)), "points: all")):
+        with pytest.raises(ValueError, match=message):
+            region_from_points(points, around())
 
 
 def test_cameras_side_by_side_take_the_points_that_they_share():
     front = [look_at(moved(k, 0, 6), moved(k), width=48, height=32) for k in (0, 0.2)]
-    region = region_from_points(ball(1.0), front)
+    region = region_from_points(ball(), front)
     assert np.linalg.norm(np.array(region.center) - CENTER) < 0.1
     assert 1.0 < region.scale < 1.15
 
@@ -120,13 +117,12 @@ def test_a_view_that_cuts_the_object_does_not_cut_the_hull():
 
 def test_masks_that_say_nothing_or_contradict_each_other_are_refused():
     cameras = around()
-    with pytest.raises(ValueError, match="show no background"):
-        region_from_masks(cameras, [np.ones((32, 48), np.float32)] * len(cameras))
-    masks = silhouettes(cameras, CENTER, 0.5)
-    for wrong in (3, 4):
-        masks[wrong] = 1 - silhouettes(cameras, CENTER, 1.5)[wrong]
-    with pytest.raises(ValueError, match="no part of space is object in enough of them"):
-        region_from_masks(cameras, masks)
+    masks, wide = silhouettes(cameras, CENTER, 0.5), silhouettes(cameras, CENTER, 1.5)
+    masks[3:5] = [1 - wide[3], 1 - wide[4]]
+    white = [np.ones((32, 48), np.float32)] * len(cameras)
+    for found, message in ((white, "show no background"), (masks, "no part of space is object")):
+        with pytest.raises(ValueError, match=message):
+            region_from_masks(cameras, found)
 
 
 @pytest.mark.parametrize("count", [4, 12, pytest.param(40, marks=pytest.mark.slow)])
@@ -137,7 +133,7 @@ def test_one_wrong_mask_does_not_cut_the_region(count):
     masks[1] = 0 * masks[1]
     assert region_from_masks(cameras, masks).scale == pytest.approx(right.scale, rel=0.35 if count == 4 else 0.1)
     if count == 40:  # half of the ball is missing in two
+        masks = silhouettes(cameras, CENTER, 0.9)
         for wrong in (1, 7):
-            masks[wrong] = silhouettes(cameras, CENTER, 0.9)[wrong]
             masks[wrong][:, :48] = 0
         assert region_from_masks(cameras, masks).scale == pytest.approx(right.scale, rel=0.1)

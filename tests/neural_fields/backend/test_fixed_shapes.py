@@ -1,4 +1,4 @@
-"""Evaluations of fixed shape: the usual results, no waits, and who found no room."""
+"""Evaluations of fixed shape: the usual results, no waits, and the overflow."""
 
 import copy
 
@@ -6,15 +6,11 @@ import pytest
 import standin
 import torch
 from bounds import assert_within, rounding
-from fields import small_multiscale, small_spacetime
+from fields import cube, small_multiscale, small_spacetime
 from mplicits.neural_fields import Field, MultiscaleSDF, Similarity, Sphere, TimeSlice, Union
-from mplicits.neural_fields.backend.fixed_shapes import FixedShapes, first_rows, fixed_shapes
+from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
 from mplicits.neural_fields.fields.csg import Placed
 from torch import Tensor
-
-
-def points(count: int = 400) -> Tensor:
-    return 2 * torch.rand(count, 3, dtype=torch.float64) - 1
 
 
 def sdf(taper: float = 0.3) -> MultiscaleSDF:
@@ -24,15 +20,14 @@ def sdf(taper: float = 0.3) -> MultiscaleSDF:
 @pytest.mark.parametrize("taper", [0.0, 0.3])
 @pytest.mark.parametrize("capacity", [None, [400, 400], [300]])
 def test_results_are_the_usual_ones(taper: float, capacity: list[int] | None) -> None:
-    field, x = sdf(taper), points()
+    field, x = sdf(taper), cube(400)
     usual = field.second_jet(x)
     with fixed_shapes(capacity) as shapes:
         fixed = field.second_jet(x)
         values, value = field.level_values(x), field.value(x.reshape(4, 100, 3))
     assert shapes.lost is None or not bool(shapes.lost.any())
     bounds = rounding(field, x, lambda field, x: field.second_jet(x))
-    for a, b, bound in zip(fixed, usual, bounds, strict=True):
-        assert_within(a, b, 2 * bound)
+    assert_within(fixed, usual, bounds, times=2)
     assert_within(value.flatten(), usual.value, 2 * bounds[0])
     assert_within(values[-1], usual.value, 2 * bounds[0])
     inside = field.level_values(x)[0].abs() < field.deltas[0]
@@ -40,7 +35,7 @@ def test_results_are_the_usual_ones(taper: float, capacity: list[int] | None) ->
 
 
 def test_gradients_are_the_usual_ones() -> None:
-    x, grown = points(), []
+    x, grown = cube(400), []
     for shaped in (False, True):
         torch.manual_seed(0)
         field, y = sdf(), x.clone().requires_grad_()
@@ -48,13 +43,12 @@ def test_gradients_are_the_usual_ones() -> None:
             jet = field.jet(y)
         (jet.value.square().sum() + jet.gradient.square().sum() + jet.features.sum()).backward()
         grown.append([y.grad, *(parameter.grad for parameter in field.parameters())])
-    for a, b in zip(*grown, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)  # float64 sums of a few hundred numbers
+    torch.testing.assert_close(*grown, rtol=1e-10, atol=1e-10)  # float64 sums of a few hundred numbers
 
 
 @pytest.mark.parametrize("room", [0, 1, 17])
-def test_who_finds_no_room_has_the_value_of_the_level_before(room: int) -> None:
-    field, x = sdf(), points()
+def test_overflow_has_the_value_of_the_level_before(room: int) -> None:
+    field, x = sdf(), cube(400)
     values = field.level_values(x)
     inside = values[0].abs() < field.deltas[0]
     with fixed_shapes([room]) as shapes:
@@ -66,8 +60,8 @@ def test_who_finds_no_room_has_the_value_of_the_level_before(room: int) -> None:
     assert_within(found, torch.where(admitted, values[1], values[0]), 2 * bound)
 
 
-def test_points_that_nobody_wants_stay_coarse() -> None:
-    field, x = sdf(), points()
+def test_points_that_are_masked_out_stay_coarse() -> None:
+    field, x = sdf(), cube(400)
     wanted = torch.arange(len(x)) % 2 == 0
     with fixed_shapes() as shapes:
         shapes.wanted = wanted
@@ -78,44 +72,37 @@ def test_points_that_nobody_wants_stay_coarse() -> None:
 
 
 def test_the_outermost_is_not_touched_by_those_inside() -> None:
-    field, x = sdf(), points()
+    field, x = sdf(), cube(400)
     with fixed_shapes() as outer:
         with fixed_shapes() as inner:
             field.value(x)
         assert inner.demand
         assert not outer.demand
-    assert isinstance(outer, FixedShapes)
 
 
 @pytest.mark.parametrize("count", [0, 1, 5])
 def test_few_points(count: int) -> None:
-    field, x = sdf(), points(count)
+    field, x = sdf(), cube(count)
     with fixed_shapes([3, 3]):
         jet = field.jet(x)
     assert jet.gradient.shape == (count, 3)
 
 
-@pytest.mark.parametrize("count", [0, 1, 40, 100])
-def test_first_rows_are_those_of_nonzero(count: int) -> None:
-    mask = torch.rand(100) < 0.4
-    expected = torch.cat((mask.nonzero()[:, 0], torch.full((100,), 100)))[:count]
-    assert torch.equal(first_rows(mask, count), expected)
-    assert torch.equal(first_rows(mask[:0], count), torch.zeros(count, dtype=torch.int64))
+def assert_no_wait(field: Field, x: Tensor, capacity: list[int] | None) -> dict[str, int]:
+    """On the stand-in → its launches."""
+    field, x = copy.deepcopy(field).to(standin.NAME), x.to(standin.NAME)
+    with standin.counted() as book, fixed_shapes(capacity):
+        field.value(x)
+        field.jet(x)
+    assert book.synchronisations == 0, book.report()
+    return book.launches
 
 
 @standin.needed
 @pytest.mark.parametrize("capacity", [None, [50, 20]])
-def test_nobody_waits_and_the_kernels_are_the_same_for_any_points(capacity: list[int] | None) -> None:
-    field = copy.deepcopy(sdf()).to(standin.NAME)
-    launched = []
-    for x in (points(), 3 * points()):  # in the bands, and far from them
-        x = x.to(standin.NAME)
-        with standin.counted() as book, fixed_shapes(capacity):
-            field.value(x)
-            field.jet(x)
-        assert book.synchronisations == 0, book.report()
-        launched.append(book.launches)
-    assert launched[0] == launched[1]
+def test_no_wait_and_the_same_kernels_for_any_points(capacity: list[int] | None) -> None:
+    near, far = (assert_no_wait(sdf(), reach * cube(400), capacity) for reach in (1, 3))
+    assert near == far
 
 
 def composed(name: str) -> Field:
@@ -130,7 +117,7 @@ def composed(name: str) -> Field:
 @standin.needed
 @pytest.mark.parametrize("name", ["union", "slice"])
 def test_fields_of_fields_need_no_wait_either(name: str, capacity: list[int] | None) -> None:
-    field, x = composed(name), points()
+    field, x = composed(name), cube(400)
     usual = field.jet(x)
     with fixed_shapes(capacity) as shapes:
         found = field.jet(x)
@@ -139,8 +126,4 @@ def test_fields_of_fields_need_no_wait_either(name: str, capacity: list[int] | N
     for a, b in zip(found, usual, strict=True):
         # The same products with other rows beside them, of 16 terms in float64.
         assert_within(a[there], b[there], 1e-11)
-    on_device, there = copy.deepcopy(field).to(standin.NAME), x.to(standin.NAME)
-    with standin.counted() as book, fixed_shapes(capacity):
-        on_device.value(there)
-        on_device.jet(there)
-    assert book.synchronisations == 0, book.report()
+    assert_no_wait(field, x, capacity)

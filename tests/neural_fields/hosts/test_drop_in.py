@@ -8,6 +8,7 @@ import textwrap
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -49,30 +50,13 @@ def provide(monkeypatch: pytest.MonkeyPatch, module: str, *names: str) -> None:
     monkeypatch.setitem(sys.modules, module, stub)
 
 
-class Step(SimpleNamespace):
-    """A Lightning module whose step is the forward pass alone."""
-
-    def __init__(self, model: SimpleNamespace) -> None:
-        super().__init__(model=model)
-
-    def __call__(self, batch: None) -> None:
-        return batch
-
-
 def test_neus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     provide(monkeypatch, "models.fields", "RenderingNetwork", "SDFNetwork", "SingleVarianceNetwork", "NeRF")
-    runner = SimpleNamespace(
-        device="cpu", optimizer=SimpleNamespace(step=lambda: None), learning_rate=5e-4, base_exp_dir=str(tmp_path)
-    )
+    runner = mock.Mock(device="cpu", learning_rate=5e-4, base_exp_dir=str(tmp_path))
     (tmp_path / "checkpoints").mkdir()
     torch.save({"lr": np.float64(5e-4)}, tmp_path / "checkpoints" / "last.pth")  # NeuS's rates are NumPy's
-    names = {
-        "self": runner,
-        "render_out": {"s_val": torch.full((4, 1), 0.05)},
-        "os": os,
-        "torch": torch,
-        "checkpoint_name": "last.pth",
-    }
+    names = {"self": runner, "os": os, "torch": torch, "checkpoint_name": "last.pth"}
+    names["render_out"] = {"s_val": torch.full((4, 1), 0.05)}
     assert apply("NeuS", names)["checkpoint"] == {"lr": 5e-4}
     x = points(10)
     assert runner.sdf_network(x).shape == (10, 33)
@@ -91,7 +75,7 @@ def test_instant_nsr_pl() -> None:
     corner = torch.full((1, 3), 1.5)
     assert (corner * geometry.scale).norm() == pytest.approx(1)
     model = SimpleNamespace(geometry=geometry, variance=SimpleNamespace(inv_s=torch.tensor(40.0)))
-    found["training_step"](Step(model), None, 0)
+    found["training_step"](mock.Mock(model=model, return_value=None), None, 0)  # the forward pass alone
     assert geometry.field.deltas.tolist() == pytest.approx([4 / 40 * geometry.scale])
 
 

@@ -32,9 +32,9 @@ def points(count: int = 40) -> Tensor:
 @pytest.mark.parametrize(
     ("x", "level", "error", "said"),
     [
-        (np.zeros((2, 3)), -1, TypeError, r"^x is a ndarray; expected a tensor \(\.\.\., 3\)"),
-        ([[0.0, 0.0, 0.0]], -1, TypeError, r"^x is a list; expected a tensor"),
-        (None, -1, TypeError, r"^x is a NoneType; expected a tensor"),
+        (np.zeros((2, 3)), -1, TypeError, r"^x is a ndarray"),
+        ([[0.0, 0.0, 0.0]], -1, TypeError, r"^x is a list"),
+        (None, -1, TypeError, r"^x is a NoneType"),
         (torch.zeros(2, 3, dtype=torch.int64), -1, TypeError, r"^x is torch\.int64, the network torch\.float32"),
         (torch.zeros(2, 3, dtype=torch.float64), -1, TypeError, r"^x is torch\.float64, .* x\.to\(field\.like\)$"),
         (torch.zeros(2, 3, dtype=torch.float16), -1, TypeError, r"^x is torch\.float16"),
@@ -42,10 +42,10 @@ def points(count: int = 40) -> Tensor:
         (torch.zeros(2, 3, device="meta"), -1, ValueError, r"^x is on meta, the network on cpu"),
         (torch.zeros(2, 4), -1, ValueError, r"^x has shape \(2, 4\); expected \(\.\.\., 3\)"),
         (torch.tensor(1.0), -1, ValueError, r"^x has shape \(\)"),
-        (torch.zeros(2, 3), 1.5, TypeError, r"^level=1\.5: expected a whole number$"),
-        (torch.zeros(2, 3), "0", TypeError, r"^level='0': expected a whole number$"),
-        (torch.zeros(2, 3), None, TypeError, r"^level=None: expected a whole number$"),
-        (torch.zeros(2, 3), 9, ValueError, r"^level=9: this field has levels 0 to "),
+        (torch.zeros(2, 3), 1.5, TypeError, r"^level=1\.5"),
+        (torch.zeros(2, 3), "0", TypeError, r"^level='0'"),
+        (torch.zeros(2, 3), None, TypeError, r"^level=None"),
+        (torch.zeros(2, 3), 9, ValueError, r"^level=9"),
     ],
 )
 def test_a_wrong_argument_is_named(method: str, x: Any, level: Any, error: type[Exception], said: str) -> None:
@@ -82,9 +82,8 @@ def test_fields_can_be_mapped_and_differentiated(index: int) -> None:
 
 
 def test_networks_with_other_weights_are_mapped_over_them() -> None:
-    """An ensemble: one field, several sets of parameters."""
     members = [Siren(8, 1).requires_grad_(False) for _ in range(3)]
-    parameters, buffers = func.stack_module_state(members)  # pyright: ignore[reportArgumentType]
+    parameters, buffers = func.stack_module_state(members)
     x = points()
 
     def call(parameters: dict[str, Tensor], buffers: dict[str, Tensor]) -> Tensor:
@@ -140,12 +139,3 @@ def test_half_precision_errs_no_more_than_its_rounding(dtype: torch.dtype) -> No
     assert found.dtype == dtype
     assert bool(((found.double() - wanted).abs() <= error[:, 0]).all())
     assert siren.jet(x).gradient.dtype == dtype
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # PyTorch's compiler of itself
-def test_compiled_fields_agree() -> None:
-    for field in fields()[:2]:
-        x = points()
-        compiled = torch.compile(field.value)
-        torch.testing.assert_close(compiled(x), field.value(x), **VMAP)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from fields import Scaled
-from mplicits.neural_fields import Box, Capsule, Jet, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
+from mplicits.neural_fields import Box, Capsule, FunctionField, Jet, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
 from mplicits.neural_fields.fields.field import OneLevelField
 from mplicits.neural_fields.meshing._cells import CORNERS, Lattice
 from mplicits.neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh, map_normals
@@ -14,7 +14,7 @@ UNIT = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
 
 class Tabulated(OneLevelField):
-    """Values given at the points of a lattice over UNIT, for meshing any pattern of signs."""
+    """Values at the points of a lattice over UNIT."""
 
     def __init__(self, values):
         super().__init__()
@@ -29,23 +29,6 @@ class Tabulated(OneLevelField):
     def jet(self, x, *, level=-1):
         value = self.value(x, level=level)
         return Jet(torch.zeros_like(value), torch.ones_like(x), x.new_empty((*x.shape[:-1], 0)))
-
-
-class Ripple(OneLevelField):
-    """A residual: ``amplitude · sin(k x) sin(k y) sin(k z)``."""
-
-    def __init__(self, amplitude, k):
-        super().__init__()
-        self.amplitude, self.k = amplitude, k
-
-    def value(self, x, *, level=-1):
-        return self.jet(x).value
-
-    def jet(self, x, *, level=-1):
-        s, c = (self.k * x).sin(), (self.k * x).cos()
-        value = self.amplitude * s.prod(-1)
-        parts = [torch.stack([c[..., i] if i == j else s[..., j] for j in range(3)], -1).prod(-1) for i in range(3)]
-        return Jet(value, self.amplitude * self.k * torch.stack(parts, -1), x.new_empty((*x.shape[:-1], 0)))
 
 
 def directed_edges(mesh: Mesh):
@@ -81,33 +64,27 @@ def euler(mesh: Mesh):
 
 def dense_values(field, resolution, bounds, level=-1):
     lattice = Lattice.over(bounds, resolution)
-    index = np.stack(np.meshgrid(*[np.arange(n + 1) for n in lattice.shape], indexing="ij"), -1).reshape(-1, 3)
-    like = next(field.parameters(), field.deltas)
-    with torch.no_grad():
-        values = field.value(torch.from_numpy(lattice.positions(index)).to(like.dtype), level=level).numpy()
-    return values.reshape([n + 1 for n in lattice.shape])
+    index = np.stack(np.indices([n + 1 for n in lattice.shape]), -1)
+    x = torch.from_numpy(lattice.positions(index.reshape(-1, 3))).to(field.like)
+    return field.value(x, level=level).reshape(index.shape[:-1]).numpy()
 
 
 def crossings(values):
     """How many cells of a dense grid have corners of both signs, and how many of its edges."""
     inside = values < 0
-    corners = [
-        inside[tuple(slice(c, n - 1 + c) for c, n in zip(corner, inside.shape, strict=True))] for corner in CORNERS
-    ]
+    i, j, k = np.array(inside.shape) - 1
+    corners = [inside[a : i + a, b : j + b, c : k + c] for a, b, c in CORNERS]
     cells = int((np.any(corners, axis=0) & ~np.all(corners, axis=0)).sum())
     return cells, sum(int((np.diff(inside.astype(np.int8), axis=axis) != 0).sum()) for axis in range(3))
 
 
+SMALL = Sphere(radius=0.3, center=(-0.5, 0, 0))
 SHAPES = {
     "sphere": (Sphere(radius=0.7), 4 / 3 * math.pi * 0.7**3, 2),
     "torus": (Torus(major=0.5, minor=0.2), 2 * math.pi**2 * 0.5 * 0.2**2, 0),
     "box": (Box(half_size=(0.4, 0.3, 0.5)), 8 * 0.4 * 0.3 * 0.5, 2),
     "capsule": (Capsule(radius=0.2), math.pi * 0.2**2 * 0.8 + 4 / 3 * math.pi * 0.2**3, 2),
-    "two": (
-        Union(Sphere(radius=0.3, center=(-0.5, 0, 0)), Box(half_size=(0.2, 0.2, 0.2), center=(0.5, 0.1, 0))),
-        4 / 3 * math.pi * 0.3**3 + 0.4**3,
-        4,
-    ),
+    "two": (Union(SMALL, Box(half_size=(0.2,) * 3, center=(0.5, 0.1, 0))), 4 / 3 * math.pi * 0.3**3 + 0.4**3, 4),
 }
 
 
@@ -129,14 +106,12 @@ def test_shapes_are_closed_outward_and_on_the_surface(name, resolution):
 
 def test_volume_converges_quadratically():
     errors = [volume(extract_mesh(Sphere(radius=0.7), resolution=n)) - SHAPES["sphere"][1] for n in (32, 64, 128)]
-    assert errors[0] / errors[1] == pytest.approx(4, rel=0.15)
-    assert errors[1] / errors[2] == pytest.approx(4, rel=0.15)
+    assert [errors[0] / errors[1], errors[1] / errors[2]] == pytest.approx([4, 4], rel=0.15)
 
 
 def test_normals_are_the_gradient():
     mesh = extract_mesh(Sphere(radius=0.6, center=(0.1, 0.0, -0.1)), resolution=48)
     radial = mesh.vertices - [0.1, 0.0, -0.1]
-    assert mesh.normals is not None
     assert mesh.normals.dtype == np.float32
     assert np.abs(mesh.normals - radial / 0.6).max() < 5e-3
     assert np.abs(np.linalg.norm(mesh.normals, axis=1) - 1).max() < 1e-6
@@ -169,8 +144,12 @@ def test_without_normals_vertices_are_interpolated():
     assert off[1] < 0.1 * off[0]
 
 
+def ripple(amplitude, k):
+    return FunctionField(lambda x: amplitude * (k * x).sin().prod(-1))
+
+
 def rippled(taper):
-    return MultiscaleSDF(Sphere(radius=0.6), [Ripple(0.02, 12.0), Ripple(0.006, 40.0)], [0.05, 0.02], taper=taper)
+    return MultiscaleSDF(Sphere(radius=0.6), [ripple(0.02, 12.0), ripple(0.006, 40.0)], [0.05, 0.02], taper=taper)
 
 
 DENSE = {name: (shape[0], 1.0001, (40, 64, 65)) for name, shape in SHAPES.items()}
@@ -182,10 +161,8 @@ def test_same_crossings_as_dense_evaluation(name):
     field, lipschitz, resolutions = DENSE[name]
     for resolution, level in itertools.product(resolutions, range(field.num_levels)):
         mesh = extract_mesh(field, resolution=resolution, level=level, lipschitz=lipschitz)
-        assert mesh.stats is not None
-        assert (mesh.stats.cells, len(mesh.vertices)) == crossings(
-            dense_values(field, resolution, ((-1.02,) * 3, (1.02,) * 3), level)
-        )
+        values = dense_values(field, resolution, ((-1.02,) * 3, (1.02,) * 3), level)
+        assert (mesh.stats.cells, len(mesh.vertices)) == crossings(values)
         assert_closed(mesh)
         assert not any(mesh.stats.points[level + 1 :])
 
@@ -194,38 +171,22 @@ def test_evaluations_grow_with_the_surface():
     spent = []
     for resolution in (64, 128, 256):
         mesh = extract_mesh(Torus(), resolution=resolution, normals=False)
-        assert mesh.stats is not None
         spent.append(sum(mesh.stats.points))
         # All in all, few points for each vertex of the mesh: nothing like the 64³ … 256³ of the box.
         assert spent[-1] < (10 if resolution == 64 else 4) * len(mesh.vertices)
-    assert spent[1] / spent[0] < 4.5
-    assert spent[2] / spent[1] < 4.5
+    assert max(spent[1] / spent[0], spent[2] / spent[1]) < 4.5
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_any_pattern_of_signs_gives_a_closed_surface(seed):
     """Random signs meet all 256 cases and every pair of ambiguous faces."""
-    generator = torch.Generator().manual_seed(seed)
-    table = torch.rand((17, 17, 17), generator=generator) + 0.1
-    table[1:-1, 1:-1, 1:-1] *= torch.where(torch.rand((15, 15, 15), generator=generator) < 0.5, -1.0, 1.0)
+    torch.manual_seed(seed)
+    table = torch.rand(17, 17, 17) + 0.1
+    table[1:-1, 1:-1, 1:-1] *= 2 * torch.randint(2, (15, 15, 15)) - 1
     mesh = extract_mesh(Tabulated(table), resolution=16, bounds=UNIT, lipschitz=100.0)
     assert_closed(mesh)
     assert_clean(mesh)
     assert volume(mesh) > 0
-
-
-def test_every_case_of_the_cube_is_closed_when_padded():
-    for case in range(256):
-        table = torch.ones(5, 5, 5)
-        for corner in range(8):
-            if case >> corner & 1:
-                i, j, k = CORNERS[corner] + 1
-                table[i, j, k] = -1.0
-        if case == 0:
-            continue
-        mesh = extract_mesh(Tabulated(table), resolution=4, bounds=UNIT, lipschitz=100.0)
-        assert_closed(mesh)
-        assert volume(mesh) > 0
 
 
 def test_values_of_exactly_zero_leave_no_crack_and_no_sliver():
@@ -234,9 +195,8 @@ def test_values_of_exactly_zero_leave_no_crack_and_no_sliver():
     assert_closed(mesh)
     assert_clean(mesh)
     assert np.abs(mesh.vertices).max(axis=0) == pytest.approx([0.5, 0.25, 0.75], abs=2e-3 * 2 / 16)
-    signs = torch.tensor([0.0, 1.0, -1.0])[torch.randint(3, (9, 9, 9), generator=torch.Generator().manual_seed(1))]
     padded = torch.ones(11, 11, 11)
-    padded[1:-1, 1:-1, 1:-1] = signs
+    padded[1:-1, 1:-1, 1:-1] = torch.randint(-1, 2, (9, 9, 9))
     random = extract_mesh(Tabulated(padded), resolution=10, bounds=UNIT, lipschitz=100.0)
     assert_closed(random)
     assert_clean(random)
@@ -282,13 +242,9 @@ def test_float64_field_is_exact_to_float64():
 
 
 def test_batches_do_not_change_the_mesh():
-    field = SHAPES["two"][0]
-    whole = extract_mesh(field, resolution=48)
-    parts = extract_mesh(field, resolution=48, batch=1000)
+    whole, parts = (extract_mesh(SHAPES["two"][0], resolution=48, batch=batch) for batch in (2**20, 1000))
     assert np.array_equal(whole.faces, parts.faces)
     assert np.abs(whole.vertices - parts.vertices).max() < 1e-6
-    assert whole.stats is not None
-    assert parts.stats is not None
     assert whole.stats.points == parts.stats.points
 
 
@@ -314,8 +270,7 @@ def test_no_surface_says_where_the_signs_are(field, words):
 
 def test_progress_is_told_every_batch():
     told = []
-    mesh = extract_mesh(Sphere(), resolution=64, batch=5000, progress=lambda *what: told.append(what))
-    assert mesh.stats is not None
+    extract_mesh(Sphere(), resolution=64, batch=5000, progress=lambda *what: told.append(what))
     assert all(0 < done <= total for _, done, total in told)
     assert {"corners", "crossings", "normals"} <= {stage for stage, _, _ in told}
 

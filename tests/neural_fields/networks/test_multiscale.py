@@ -1,38 +1,23 @@
-"""Gating: where residuals act, what they cost, and the taper's continuity."""
-
 from collections.abc import Callable
 
 import pytest
 import torch
 from bounds import assert_within, rounding
-from fields import Watched, small_multiscale
-from mplicits.neural_fields import Field, Jet, Moving, MultiscaleSDF, RigidMotion, Siren, Sphere, TimeSlice
-from mplicits.neural_fields.fields.field import OneLevelField
+from fields import Watched, cube, small_multiscale
+from mplicits.neural_fields import Field, FunctionField, Moving, MultiscaleSDF, RigidMotion, Siren, Sphere, TimeSlice
+from mplicits.neural_fields.networks.multiscale import fit_sphere, solve_sphere
 from torch import Tensor
 
 
-class Constant(OneLevelField):
-    """A residual that is the same everywhere."""
-
-    def __init__(self, constant: float) -> None:
-        super().__init__()
-        self.constant = constant
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        return x.new_full(x.shape[:-1], self.constant)
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        return Jet(self.value(x), torch.zeros_like(x), x.new_empty((*x.shape[:-1], 0)))
-
-
 def watched_levels() -> tuple[MultiscaleSDF, list[Watched]]:
-    levels = [Watched(Sphere(radius=0.5)), Watched(Constant(0.01)), Watched(Constant(0.02))]
+    residuals = [FunctionField(lambda x, c=constant: 0 * x[..., 0] + c) for constant in (0.01, 0.02)]
+    levels = [Watched(field) for field in (Sphere(radius=0.5), *residuals)]
     return MultiscaleSDF(levels[0], levels[1:], [0.1, 0.05]), levels
 
 
 def test_sum_of_the_paper_is_the_field() -> None:
     sdf = small_multiscale().double()
-    x = 2 * torch.rand(500, 3, dtype=torch.float64) - 1
+    x = cube(500)
     base, *residuals = sdf.levels
     f = base.value(x)
     inside = torch.ones(len(x), dtype=torch.bool)
@@ -69,7 +54,7 @@ def test_every_level_is_evaluated_once_and_only_in_its_band(method: str, level: 
     rows = [len(x), int(in_first.sum()), int(in_both.sum())]
     assert 0 < rows[2] < rows[1] < 1000
     METHODS[method](field, x, level)
-    # The band of a level is that of the coarser ones: the level itself is not asked.
+    # The band of a level is that of the coarser ones.
     needed = level if method == "in_band" else level + 1
     asked = [count if index < needed else 0 for index, count in enumerate(rows)]
     jets = method in ("jet", "second_jet")
@@ -104,8 +89,7 @@ def test_with_level_shares_the_levels() -> None:
     base, residual = Siren(8, 1), Siren(8, 2)
     one = MultiscaleSDF(base, [], [])
     two = one.with_level(residual, delta=0.2)
-    assert two.base is base
-    assert two.num_levels == 2
+    assert (two.base, two.num_levels) == (base, 2)
     assert torch.equal(two.deltas, torch.tensor([0.2]))
     x = torch.rand(20, 3)
     assert torch.equal(two.value(x, level=0), one.value(x))
@@ -115,3 +99,92 @@ def test_training_reaches_every_level() -> None:
     sdf = small_multiscale(0.3)
     sdf.jet(2 * torch.rand(500, 3) - 1).gradient.square().sum().backward()
     assert all(p.grad is not None and bool((p.grad != 0).any()) for n, p in sdf.named_parameters() if "weight" in n)
+
+
+@pytest.mark.parametrize("radius", [0.3, 0.5, 0.8])
+def test_a_siren_becomes_the_distance_of_a_sphere(radius: float) -> None:
+    network = Siren(32, 2, omega=10.0)
+    x = torch.nn.functional.normalize(torch.randn(4000, 3), dim=1) * torch.rand(4000, 1)
+    with torch.no_grad():
+        before = (network.value(x) - (x.norm(dim=1) - radius)).abs().mean()
+    fit_sphere(network, radius)
+    with torch.no_grad():
+        jet = network.jet(x)
+    error = jet.value - (x.norm(dim=1) - radius)
+    assert float(error.square().mean().sqrt()) < 0.03
+    assert float(error.abs().mean()) < 0.2 * float(before)
+    off = (x.norm(dim=1) - radius).abs() > 0.08
+    assert torch.equal(jet.value[off] > 0, x.norm(dim=1)[off] > radius)
+    away = x.norm(dim=1) > 0.15  # the distance has a kink in the middle, a network has none
+    cosine = torch.nn.functional.cosine_similarity(jet.gradient[away], x[away], dim=1)
+    assert float(cosine.mean()) > 0.98
+    assert abs(float(jet.gradient[away].norm(dim=1).mean()) - 1) < 0.1
+
+
+def solved(radius: float = 0.35) -> Siren:
+    network = Siren(128, 4, omega=10.0, num_features=3)
+    solve_sphere(network, radius)
+    return network
+
+
+@pytest.mark.parametrize("radius", [0.2, 0.35, 0.7])
+def test_a_solved_start_is_a_sphere_as_near_as_it_says(radius: float) -> None:
+    """Off by 0.01, and its slopes by 0.1, in the root mean square, as the function's description has it."""
+    for seed in range(3):
+        torch.manual_seed(seed)
+        network = solved(radius)
+        direction = torch.nn.functional.normalize(torch.randn(4000, 3), dim=1)
+        x = direction * torch.rand(4000, 1) ** (1 / 3)
+        with torch.no_grad():
+            jet = network.jet(x)
+        error = (jet.value - (x.norm(dim=1) - radius)).square().mean().sqrt()
+        assert float(error) < 1.5 * 0.01
+        away = x.norm(dim=1) > 0.15  # the distance has a kink in the middle, a network has none
+        slopes = (jet.gradient - direction)[away].square().sum(dim=1).mean().sqrt()
+        assert float(slopes) < 1.5 * 0.1
+
+
+def test_no_other_output_is_nearer() -> None:
+    """At the least of a sum of squares nothing is gained to first order, whichever weight is changed."""
+    network = solved().double()
+    torch.manual_seed(0)
+    solve_sphere(network, 0.35)
+    generator, count = torch.Generator().manual_seed(0), 8 * 129
+    direction = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    direction = torch.nn.functional.normalize(direction, dim=1)
+    lengths = 1.05 * torch.rand(count, 1, generator=generator, dtype=torch.float64).sqrt()
+    jet = network.jet(direction * lengths)
+    misses = (jet.value - lengths[:, 0] + 0.35).square() + 0.1 * (jet.gradient - direction).square().sum(dim=1)
+    total = misses.sum() + 1e-6 * count * network.output.weight[0].square().sum()
+    slope = torch.autograd.grad(total, [network.output.weight, network.output.bias])
+    # Sums of `count` terms, each below one.
+    bound = 1e4 * float(total.detach()) * count * torch.finfo(torch.float64).eps
+    assert max(float(part[0].abs().max()) for part in slope) < bound
+
+
+def test_a_solved_start_draws_nothing_and_leaves_features_and_units() -> None:
+    torch.manual_seed(4)
+    network = Siren(16, 2, omega=10.0, num_features=2)
+    network.set_units(0.5, 0.25)
+    state = torch.get_rng_state()
+    kept = network.output.weight[1:].clone()
+    solve_sphere(network, 0.5)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert torch.equal(network.output.weight[1:], kept)
+    assert network.units == (0.5, 0.25)
+    first = network.state_dict()
+    solve_sphere(network, 0.5)  # once more is the same
+    for name, tensor in network.state_dict().items():
+        torch.testing.assert_close(tensor, first[name], rtol=1e-4, atol=1e-4)
+
+
+def test_a_trained_start_does_not_depend_on_units() -> None:
+    found = []
+    for units in ((1.0, 1.0), (0.5, 0.25)):
+        torch.manual_seed(4)
+        network = Siren(16, 2, omega=10.0)
+        network.set_units(*units)
+        fit_sphere(network, steps=5, batch=64)
+        assert network.units == units
+        found.append(network.state_dict())
+    assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])

@@ -1,5 +1,3 @@
-"""The peers: gradients against autograd, the contract of fields, and what their papers say of them."""
-
 import torch
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 

@@ -56,7 +56,6 @@ def test_the_default_serves_single_precision() -> None:
 
 
 def test_tolerances_hold_for_every_point() -> None:
-    """One point in a fast eddy among two thousand that hardly move."""
     speed = torch.full((2_000,), 0.01, dtype=torch.float64)
     speed[7] = 40.0
     x = sphere_points(2_000, 1.0)
@@ -97,6 +96,12 @@ def test_points_of_a_shrinking_sphere_go_straight_to_its_centre() -> None:
     torch.testing.assert_close(back.points[-1], x, rtol=0, atol=1e-6)
 
 
+def test_a_turning_sphere_leaves_its_points_where_they_are() -> None:
+    x = sphere_points(20, 0.5)
+    tracks = track(Moving(Sphere(radius=0.5), RigidMotion(angle=3.0)), x, [0.0, 1.0])
+    torch.testing.assert_close(tracks.points[-1], x, rtol=0, atol=1e-12)
+
+
 def test_points_of_a_translating_sphere_slide_as_the_closed_form_says() -> None:
     """With n the normal of a point, n′ = −(v − ⟨v, n⟩n)/r: tan(θ/2) grows as e^{|v|t/r}, θ its angle from v."""
     field = Moving(Sphere(radius=0.5), RigidMotion(velocity=(0.0, 0.0, 0.6)))
@@ -106,12 +111,6 @@ def test_points_of_a_translating_sphere_slide_as_the_closed_form_says() -> None:
     half = (x[:, 2] / 0.5).acos() / 2
     expected = 2 * (half.tan() * math.exp(0.6 / 0.5)).atan()
     torch.testing.assert_close(normal[:, 2].clamp(-1, 1).acos(), expected, rtol=0, atol=1e-6)
-
-
-def test_a_turning_sphere_leaves_its_points_where_they_are() -> None:
-    x = sphere_points(20, 0.5)
-    tracks = track(Moving(Sphere(radius=0.5), RigidMotion(angle=3.0)), x, [0.0, 1.0])
-    torch.testing.assert_close(tracks.points[-1], x, rtol=0, atol=1e-12)
 
 
 class Swirl(nn.Module):
@@ -131,8 +130,6 @@ def test_gradients_of_a_flow(adjoint: bool, method: str) -> None:
     swirl, x = Swirl(), torch.randn(10, 3, dtype=torch.float64, requires_grad=True)
     solver = Solver(method=method, rtol=1e-9, atol=1e-10, adjoint=adjoint)
     flow(swirl, x, 0.0, 1.0, solver=solver).sum().backward()
-    assert x.grad is not None
-    assert swirl.a.grad is not None
     torch.testing.assert_close(x.grad, torch.full_like(x, math.exp(0.3)), rtol=0, atol=1e-6)
     torch.testing.assert_close(swirl.a.grad, math.exp(0.3) * x.detach().sum(), rtol=0, atol=1e-6)
 
@@ -142,10 +139,9 @@ def test_the_adjoint_of_a_track_reaches_the_field() -> None:
     x = torch.rand(8, 3, dtype=torch.float64)
     gradients = []
     for adjoint in (False, True):
-        field.zero_grad()
         solver = Solver(method="rk4", step=0.02, adjoint=adjoint)
-        track(field, x, [0.0, 0.3], project=False, solver=solver).points[-1].square().sum().backward()
-        gradients.append(torch.cat([p.grad.flatten() for p in field.parameters() if p.grad is not None]))
+        loss = track(field, x, [0.0, 0.3], project=False, solver=solver).points[-1].square().sum()
+        gradients.append(torch.autograd.grad(loss, field.parameters(), materialize_grads=True))
     torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-5)
 
 
@@ -159,7 +155,6 @@ def test_a_flow_that_blows_up_reports_the_time_reached() -> None:
     with pytest.raises(IntegrationError, match=r"reached time 0\.(49|5)") as caught:
         flow(blow_up, x, 0.0, 1.0)
     assert float(caught.value.time) == pytest.approx(0.5, abs=1e-2)
-    assert caught.value.points.shape == (1, 3)
     assert float(caught.value.points[0, 0]) > 100
     with pytest.raises(IntegrationError, match=r"more than 5 steps; reached time 0\.\d+") as caught:
         flow(blow_up, x, 0.0, 1.0, solver=Solver(max_steps=5))

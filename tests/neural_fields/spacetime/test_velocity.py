@@ -68,10 +68,8 @@ def test_characteristics_of_linear_flows(rows: tuple[tuple[float, ...], ...]) ->
 
 def test_energies_of_linear_flows() -> None:
     x, t = torch.randn(5, 3, dtype=torch.float64), torch.zeros(5, dtype=torch.float64)
-    energies = [
-        (Linear(rows).jet(x, t).divergence, Linear(rows).jet(x, t).killing) for rows in (ROTATION, SHEAR, EXPANSION)
-    ]
-    found = [(float(divergence[0]), float(killing[0])) for divergence, killing in energies]
+    jets = [Linear(rows).jet(x, t) for rows in (ROTATION, SHEAR, EXPANSION)]
+    found = [(float(jet.divergence[0]), float(jet.killing[0])) for jet in jets]
     assert found == [(0, 0), (0, pytest.approx(2 * 1.2**2)), (pytest.approx(3 * 0.7), pytest.approx(3 * 1.4**2))]
 
 

@@ -1,23 +1,22 @@
-"""Cones for tiles of an image: never beyond the surface."""
-
 import pytest
 import torch
-from fields import FIELDS, Scaled
+from fields import FIELDS, Scaled, sphere_depth
 from mplicits.neural_fields import Sphere, sphere_trace
 from mplicits.neural_fields.tracing.cones import cone_starts
 from torch.nn.functional import normalize
 
-THREE_D = {name: make for name, make in FIELDS.items() if make().in_dim == 3}
+
+def pinhole(reach, size):
+    across = torch.linspace(-reach, reach, size, dtype=torch.float64)
+    rows, columns = torch.meshgrid(across, across, indexing="ij")
+    return normalize(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1), dim=-1)
 
 
 def test_cones_that_find_themselves_behind_the_surface_go_back():
-    across = torch.linspace(-0.1, 0.1, 64, dtype=torch.float64)
-    rows, columns = torch.meshgrid(across, across, indexing="ij")
-    directions = normalize(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1), dim=-1)
+    directions = pinhole(0.1, 64)
     origin = torch.tensor([0.0, 0.0, -2.5], dtype=torch.float64)
     near = cone_starts(Scaled(Sphere(radius=0.6), 1.3).double(), origin, directions)
-    along = -(directions @ origin)
-    expected = along - (along**2 - origin @ origin + 0.6**2).sqrt()
+    expected = sphere_depth(origin, directions, 0.6)
     assert bool(expected.isfinite().all())
     assert bool((near < expected).all())
 
@@ -25,11 +24,9 @@ def test_cones_that_find_themselves_behind_the_surface_go_back():
 @pytest.mark.parametrize("level", [0, -1])
 @pytest.mark.parametrize("name", ["sphere", "torus", "box", "multiscale-over-sphere"])
 def test_cones_stop_before_the_surface(name, level):
-    field = THREE_D[name]().double().requires_grad_(False)
+    field = FIELDS[name]().double().requires_grad_(False)
     origin = torch.tensor([0.4, 0.3, -3.0], dtype=torch.float64)
-    across = torch.linspace(-0.4, 0.4, 75, dtype=torch.float64)
-    rows, columns = torch.meshgrid(across[:60], across, indexing="ij")
-    directions = normalize(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1), dim=-1)
+    directions = pinhole(0.4, 75)[:60]
     near = cone_starts(field, origin, directions, level=level, lipschitz=1.3)
     hits = sphere_trace(field, origin, directions, level=level, lipschitz=1.3)
     assert near.shape == (60, 75)

@@ -1,9 +1,11 @@
 """The march that runs ahead of the host, on the CPU, against the one that looks after every pass."""
 
+from unittest import mock
+
 import pytest
 import torch
-from fields import FIELDS, Watched, small_multiscale
-from mplicits.neural_fields import Field, FunctionField, Sphere, Torus, sphere_trace
+from fields import FIELDS, Watched, assert_depths, small_multiscale
+from mplicits.neural_fields import Field, Sphere, Torus, sphere_trace
 from mplicits.neural_fields.backend.fixed_shapes import current_shapes
 from mplicits.neural_fields.tracing import _march_gpu as _ahead
 from mplicits.neural_fields.tracing import sphere as tracing
@@ -14,19 +16,13 @@ from waits import some_rays, three_levels
 CLOSED = {"sphere": Sphere(radius=0.5), "torus": Torus(major=0.5, minor=0.2)}
 
 
-@pytest.fixture
-def both(monkeypatch: pytest.MonkeyPatch):
+def both(work, *arguments, **options):
     """Call a function with the one march and with the other."""
-
-    def call(work, *arguments, **options):
-        found = []
-        for ahead in (False, True):
-            with monkeypatch.context() as patch:
-                patch.setattr(tracing, "makes_wait", lambda _, ahead=ahead: ahead)
-                found.append(work(*arguments, **options))
-        return found
-
-    return call
+    found = []
+    for ahead in (False, True):
+        with mock.patch.object(tracing, "makes_wait", return_value=ahead):
+            found.append(work(*arguments, **options))
+    return found
 
 
 def rays(dtype: torch.dtype, count: int = 200) -> tuple[Tensor, Tensor]:
@@ -54,99 +50,74 @@ def assert_same_bits(first, second) -> None:
         {"tolerance": 1e-3},
     ],
 )
-def test_closed_forms_agree_to_the_last_bit(name: str, options: dict, dtype: torch.dtype, both) -> None:
-    """Depths, levels, numbers of steps: every ray sees the same values."""
+def test_closed_forms_agree_to_the_last_bit(name: str, options: dict, dtype: torch.dtype) -> None:
     field, (origins, directions) = CLOSED[name].to(dtype), rays(dtype)
     assert_same_bits(*both(sphere_trace, field, origins, directions, **options))
-    inside = sphere_trace(field, origins * 0.1, directions, **options)
-    assert inside.mask.shape == (200,)
     assert_same_bits(*both(sphere_trace, field, origins * 0.1, directions, **options))
 
 
 @pytest.mark.parametrize("off", [0.0, 0.02, -0.02, 0.4])
-def test_expectations_right_and_wrong(off: float, both) -> None:
+def test_expectations_right_and_wrong(off: float) -> None:
     field, (origins, directions) = CLOSED["torus"].double(), rays(torch.float64)
     hits, slope, _ = trace_expected(field, origins, directions, None)
     unknown = torch.full_like(hits.depth, torch.inf)
     for value in (unknown, field.value(origins)):
         expected = Expected(torch.where(hits.mask, hits.depth + off, torch.inf), slope, value)
         (first, *columns), (second, *others) = both(trace_expected, field, origins, directions, expected, reach=0.1)
-        assert_same_bits(first, second)
-        assert torch.equal(columns[0], others[0])
-        for a, b in zip(columns[1], others[1], strict=True):
-            assert torch.equal(a, b)
+        assert_same_bits((*first, columns[0], *columns[1]), (*second, others[0], *others[1]))
 
 
 @pytest.mark.parametrize("few", [_ahead.FEW, 20], ids=["room", "little-room"])
-def test_levels_agree_within_the_tolerance(few: int, both, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With little room rays stand still until there is some, and end where they would have ended.
-
-    Products of matrices with other rows beside them round otherwise, so that depths may differ, but each is known to
-    the tolerance; in float64 roundings are far below what would make it another hit.
-    """
-    monkeypatch.setattr(_ahead, "FEW", few)
-    monkeypatch.setattr(_ahead, "SHARE", 0.01)
-    monkeypatch.setattr(_ahead, "LEAST_ROOM", 5)
-    monkeypatch.setattr(_ahead, "SPARE", 0.6)
+def test_levels_agree_within_the_tolerance(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Matrix products with other rows beside them round differently; each depth is exact to the tolerance."""
+    for name, number in {"FEW": few, "SHARE": 0.01, "LEAST_ROOM": 5, "SPARE": 0.6}.items():
+        monkeypatch.setattr(_ahead, name, number)
     origins, directions = rays(torch.float64)
     for field in (three_levels().double(), small_multiscale(0.3).double()):
         first, second = both(sphere_trace, field, origins, directions, tolerance=1e-7)
-        assert torch.equal(first.mask, second.mask)
         assert int(first.mask.sum()) > 20
-        assert float((first.depth - second.depth)[first.mask].abs().max()) < 2e-7
+        assert_depths(first, second, 2e-7)
         assert torch.equal(first.level[first.mask], second.level[second.mask])
 
 
 @pytest.mark.parametrize("few", [_ahead.FEW, 5], ids=["room", "little-room"])
 @pytest.mark.parametrize("name", ["union", "placed", "difference-of-multiscale", "slice"])
-def test_fields_of_fields(name: str, few: int, both, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fields_of_fields(name: str, few: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_ahead, "FEW", few)
     monkeypatch.setattr(_ahead, "LEAST_ROOM", few)
     field: Field = FIELDS[name]().double()
     origins, directions = rays(torch.float64, 60)
-    first, second = both(sphere_trace, field, origins, directions, max_steps=64)
-    assert torch.equal(first.mask, second.mask)
-    assert float((first.depth - second.depth)[first.mask].abs().max()) < 2e-5
+    assert_depths(*both(sphere_trace, field, origins, directions, max_steps=64), 2e-5)
 
 
 class Own(Watched):
-    """A user's field around another, which notes whether shapes are fixed."""
+    """A user's field around another, which records whether shapes are fixed."""
+
+    same_rows = None
 
     def __init__(self, inner: Field, *, same_rows: bool) -> None:
         super().__init__(inner)
         self.fixed: list[bool] = []
-        self._same = same_rows
-
-    @property
-    def same_rows(self) -> bool:
-        return self._same
+        self.same_rows = same_rows
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         self.fixed.append(current_shapes() is not None)
         return super().value(x, level=level)
 
 
-def test_a_users_field_chooses_its_path(both) -> None:
-    """It takes the fast one if it says that fields inside see its rows; by default one that holds none does."""
+def test_a_users_field_chooses_its_path() -> None:
     origins, directions = rays(torch.float64)
     for same in (True, False):
         field = Own(three_levels().double(), same_rows=same)
-        first, second = both(sphere_trace, field, origins, directions, tolerance=1e-7)
-        assert torch.equal(first.mask, second.mask)
-        assert float((first.depth - second.depth)[first.mask].abs().max()) < 2e-7
+        assert_depths(*both(sphere_trace, field, origins, directions, tolerance=1e-7), 2e-7)
         assert any(field.fixed) == same
     assert Sphere().same_rows
     assert not Watched(Sphere()).same_rows
-    assert not FunctionField(lambda x: x.norm(dim=-1)).same_rows
+    for name, same in (("difference-of-multiscale", True), ("slice", True), ("function", False)):
+        assert FIELDS[name]().same_rows == same
 
 
-@pytest.mark.parametrize(("name", "same"), [("difference-of-multiscale", True), ("slice", True), ("function", False)])
-def test_same_rows_of_fields_of_fields(name: str, same: bool) -> None:
-    field = FIELDS[name]()
-    assert field.same_rows == same
-
-
-def test_no_rays(both) -> None:
+def test_no_rays() -> None:
     nothing = torch.zeros(0, 3)
     assert_same_bits(*both(sphere_trace, CLOSED["sphere"].float(), nothing, nothing))
     away = torch.tensor([[0.0, 0.0, 3.0]])

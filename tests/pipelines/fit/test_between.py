@@ -5,20 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import PointCloud
-from mplicits.datasets.synthetic.samples import sample_sphere, sample_torus
+from fits import SMALL
+from mplicits.datasets import PointCloud, sample_sphere, sample_torus
 from mplicits.neural_fields import Torus
-from mplicits.pipelines.fit import between
+from mplicits.pipelines.fit import between, fit
 from mplicits.pipelines.fit.between import BETWEEN, Densified, dense_distance, densified
 from mplicits.pipelines.fit.cloud import CloudDistance
-from mplicits.pipelines.fit.train import fit
-from mplicits.pipelines.training.settings import FitConfig
 from scipy.spatial import KDTree
 
-Float64 = np.ndarray
 
-
-def box(count: int, half: float = 0.5) -> tuple[Float64, Float64]:
+def box(count: int, half: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
     """Points uniform on a cube, with the exact normals of its faces."""
     random = np.random.default_rng(2)
     axis, sign = random.integers(0, 3, count), random.choice([-half, half], count)
@@ -29,7 +25,7 @@ def box(count: int, half: float = 0.5) -> tuple[Float64, Float64]:
     return points, normals
 
 
-def cube_grid(cells: int, half: float = 0.5) -> tuple[Float64, Float64, np.ndarray]:
+def cube_grid(cells: int, half: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The vertices of a cube cut into squares, with the mean normals of their faces; how many faces each is on."""
     line = np.linspace(-half, half, cells + 1)
     points = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -146,7 +142,7 @@ def test_guessed_normals_are_not_followed_beyond_the_rim_of_a_strip() -> None:
     assert len(guessed) > 0.7 * len(believed)
 
 
-def noisy_filling(points: Float64, normals: Float64) -> Float64:
+def noisy_filling(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """The points that fill in a cloud with noise and estimated normals."""
     given = (torch.from_numpy(a.astype(np.float32)) for a in (points, normals))
     index = dense_distance(*given, omega=1000.0, count=6000, noise=0.001, guessed=True)
@@ -154,16 +150,11 @@ def noisy_filling(points: Float64, normals: Float64) -> Float64:
 
 
 def test_guessed_normals_do_not_lead_beyond_a_corner(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a solid nothing fills the sky over its corners, and winding numbers know that; an open sheet they do not."""
-    found = Densified(np.empty((0, 3)), 0, np.empty((0, 3)), np.empty((0, 3)))
+    """Winding numbers tell the corner of a solid, which nothing goes beyond, from the rim of an open sheet."""
     points, normals = box(2000)
-    on_face, beyond = np.array([[0.1, 0.2, 0.5]]), np.array([[0.56, 0.56, 0.56]])
-    places = np.concatenate((on_face, beyond))
-    up = np.tile([0.0, 0.0, 1.0], (2, 1))
-    monkeypatch.setattr(
-        between, "densified", lambda p, n, *_, **__: found._replace(normals=n, points=places, new_normals=up)
-    )
-    assert np.allclose(noisy_filling(points, normals), on_face)
+    places, up = np.array([[0.1, 0.2, 0.5], [0.56, 0.56, 0.56]]), np.tile([0.0, 0.0, 1.0], (2, 1))
+    monkeypatch.setattr(between, "densified", lambda p, n, *_, **__: Densified(n, 0, places, up))
+    assert np.allclose(noisy_filling(points, normals), places[:1])
     sheet = points * [1, 1, 0]
     assert np.allclose(noisy_filling(sheet, np.tile([0.0, 0.0, 1.0], (len(sheet), 1))), places)
 
@@ -195,15 +186,8 @@ def test_a_cloud_is_filled_in_where_it_is_sparse_for_the_frequency() -> None:
 def test_sharp_edges_do_not_roughen_the_faces() -> None:
     # Edges leave errors that no network can take away. Where those count squared, the faces are learnt last.
     points, normals = box(3000)
-    small = FitConfig(
-        widths=(32, 96),
-        depths=(2, 2),
-        omegas=(15.0, 40.0),
-        steps=(150, 120),
-        learning_rates=(4e-3, 1e-3),
-        batch=2048,
-        samples=10_000,
-    )
+    levels = {"widths": (32, 96), "omegas": (15.0, 40.0), "steps": (150, 120), "learning_rates": (4e-3, 1e-3)}
+    small = replace(SMALL, **levels, batch=2048, samples=10_000)
     faces, exact = box(4000)
     inner = np.sort(np.abs(faces), axis=1)[:, 1] < 0.4  # not beside an edge
     found = {}

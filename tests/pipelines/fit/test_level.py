@@ -1,29 +1,20 @@
 """Held-out points: drawn by voxels, and a level that is worse at them is not kept."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import PointCloud
-from mplicits.datasets.synthetic.samples import sample_sphere
+from fits import SMALL
+from mplicits.datasets import PointCloud, sample_sphere
 from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.fit import describe
-from mplicits.pipelines.fit.level import (
-    JUDGE,
-    Each,
-    Error,
-    Fall,
-    Judge,
-    LevelObjective,
-    Verdict,
-    held_out,
-    standard_errors,
-)
+from mplicits.pipelines.fit.level import JUDGE, Error, Fall, Judge, LevelObjective, Verdict, held_out, standard_errors
 from mplicits.pipelines.fit.samples import Samples, Source, Usual, with_previous
 from mplicits.pipelines.fit.train import fit
-from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Group, Trainer
 
 CPU = torch.device("cpu")
@@ -76,6 +67,9 @@ def test_the_loss_at_held_out_points_is_that_of_equation_4() -> None:
     assert judge.errors(zero_siren(-OFF)).mean().loss == pytest.approx(0, abs=1e-6)  # 3 (1 − cos), in float32
     assert judge.errors(zero_siren(OFF)).mean().loss == pytest.approx(100 * (2 * OFF) ** 2, rel=1e-4)
     x = points(1000)
+    outside = Judge(x, x, Sphere(radius=0.1), 0.1, spacing=SPACING, data=1.0, normal=1.0)  # of the band
+    assert outside.count == 0
+    assert not outside.verdict(outside.without, 1.0).better
     against = Judge(x, -x / RADIUS, Sphere(radius=RADIUS), 0.1, spacing=SPACING, data=1.0, normal=3.0)
     assert against.before.loss == pytest.approx(2 * 3.0, rel=1e-6)
     assert against.before.angle == pytest.approx(180, abs=0.1)
@@ -83,10 +77,9 @@ def test_the_loss_at_held_out_points_is_that_of_equation_4() -> None:
 
 def test_the_angle_at_held_out_points_is_their_mean() -> None:
     x = points(1001)
-    normals = x / RADIUS
-    across = torch.nn.functional.normalize(torch.linalg.cross(normals, torch.tensor([[0.3, 0.5, -0.8]])), dim=1)
+    across = torch.nn.functional.normalize(torch.linalg.cross(x, torch.tensor([[0.3, 0.5, -0.8]])), dim=1)
     angle = torch.deg2rad(torch.linspace(0, 8, 1001) ** 2 / 8)[:, None]
-    tilted = angle.cos() * normals + angle.sin() * across
+    tilted = angle.cos() * x / RADIUS + angle.sin() * across
     judge = Judge(x, tilted, Sphere(radius=RADIUS), 0.1, spacing=SPACING, data=1.0, normal=1.0)
     assert judge.before.angle == pytest.approx(8 / 3, rel=1e-3)
     assert judge.before.loss == pytest.approx(float((1 - angle.cos()).mean()), rel=1e-3)
@@ -94,18 +87,10 @@ def test_the_angle_at_held_out_points_is_their_mean() -> None:
 
 def test_large_errors_count_as_the_level_counts_them() -> None:
     x = points(1000)
-    usual = Usual(data=1e-5, normal=1e-3)
-    terms = {"data": 100.0, "normal": 3.0, "usual": usual}
+    terms = {"data": 100.0, "normal": 3.0, "usual": Usual(data=1e-5, normal=1e-3)}
     judge = Judge(x, -x / RADIUS, Sphere(radius=RADIUS - OFF), 0.1, spacing=SPACING, **terms)
     turned, away = 1e-3 * ((1 + 4 / 1e-3) ** 0.5 - 1), 1e-5 * ((1 + 2 * OFF**2 / 1e-5) ** 0.5 - 1)  # 1 − cos = 2
     assert judge.before.loss == pytest.approx(3 * turned + 100 * away, rel=1e-4)
-
-
-def test_no_points_have_no_error() -> None:
-    x = points(1000)
-    judge = Judge(x, x, Sphere(radius=0.1), 0.1, spacing=SPACING, data=1.0, normal=1.0)  # all outside the band
-    assert judge.count == 0
-    assert not judge.verdict(judge.without, 1.0).better
 
 
 def objective(judge: Judge, target: float) -> LevelObjective:
@@ -119,17 +104,17 @@ def objective(judge: Judge, target: float) -> LevelObjective:
 
 def test_the_best_weights_are_kept_and_checkpoints_keep_them() -> None:
     # Before: f = OFF at the points. The level learns f = −3 OFF there, and passes by the truth on its way.
-    level = objective(judge_of(RADIUS - OFF), -3 * OFF)
-    trainer = Trainer(level, stage="level 1", steps=80)
+    learner = objective(judge_of(RADIUS - OFF), -3 * OFF)
+    trainer = Trainer(learner, stage="level 1", steps=80)
     trainer.run()
-    last = level.judge.errors(level.siren).mean()  # type: ignore[union-attr]
+    last = learner.judge.errors(learner.siren).mean()
     other = objective(judge_of(RADIUS - OFF), -3 * OFF)
     resumed = Trainer(other, stage="level 1", steps=80)
     resumed.restore(trainer.state())
-    verdict = level.take_best()
+    verdict = learner.take_best()
     assert verdict.after.loss < last.loss
     assert 0 < verdict.at < 1
-    assert level.judge.errors(level.siren).mean() == verdict.after  # type: ignore[union-attr]
+    assert learner.judge.errors(learner.siren).mean() == verdict.after
     assert other.take_best() == verdict
 
 
@@ -141,8 +126,7 @@ def test_training_ends_where_held_out_points_say_that_everything_gets_worse() ->
     trainer = Trainer(wrong, stage="level 1", steps=80)
     assert trainer.run()
     assert trainer.step == 30 + 1  # judged at every eighth of the schedule, from three on
-    verdict = wrong.take_best()
-    assert not verdict.better
+    assert not wrong.take_best().better
     resumed = Trainer(objective(judge_of(RADIUS - OFF), 0.0), stage="level 1", steps=80)
     resumed.restore(trainer.state())
     assert resumed.run()
@@ -154,10 +138,8 @@ def test_what_chance_may_have_done_is_not_sure() -> None:
     # Their mean is 1, and their standard deviation √(100 / 99).
     assert standard_errors(falls, apart) == pytest.approx(1 / (100 / 99) ** 0.5 * 10, rel=1e-6)
     assert standard_errors(-falls, apart) == pytest.approx(-standard_errors(falls, apart))
-    assert standard_errors(torch.ones(100), apart) == math.inf
-    assert standard_errors(-torch.ones(100), apart) == -math.inf
-    assert standard_errors(torch.zeros(100), apart) == 0
-    assert standard_errors(torch.full((100,), math.nan), apart) == -math.inf
+    for fall, expected in ((1.0, math.inf), (-1.0, -math.inf), (0.0, 0.0), (math.nan, -math.inf)):
+        assert standard_errors(torch.full((100,), fall), apart) == expected
     assert standard_errors(torch.zeros(0), torch.zeros(0, dtype=torch.int64)) == 0
 
 
@@ -172,35 +154,35 @@ def test_points_of_one_voxel_count_once() -> None:
 
 
 def test_a_level_goes_back_to_what_was_surely_better() -> None:
-    level = objective(judge_of(RADIUS - OFF), 0.0)
+    learner = objective(judge_of(RADIUS - OFF), 0.0)
     for bias, done in ((-0.99 * OFF, 0.5), (-0.9 * OFF, 1.0)):
-        torch.nn.init.constant_(level.siren.output.bias, bias)
-        level.look(done)
-    verdict = level.take_best()
+        torch.nn.init.constant_(learner.siren.output.bias, bias)
+        learner.look(done)
+    verdict = learner.take_best()
     assert verdict.at == 0.5
-    assert float(level.siren.output.bias.detach()) == pytest.approx(-0.99 * OFF, rel=1e-6)
+    assert float(learner.siren.output.bias.detach()) == pytest.approx(-0.99 * OFF, rel=1e-6)
     assert verdict.after.distance == pytest.approx(0.01 * OFF, rel=1e-3)
 
 
 @pytest.mark.parametrize("guessed", [True, False])
 def test_a_few_far_points_send_no_level_back(guessed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     # Of a thousand points 998 come to be exact, and two so far off that the mean square is above that at the start.
-    level = objective(judge_of(RADIUS - OFF, guessed=guessed), 0.0)
-    judge = level.judge
+    learner = objective(judge_of(RADIUS - OFF, guessed=guessed), 0.0)
+    judge = learner.judge
     few = torch.where(torch.arange(1000) < 2, 30 * OFF, 0.0)
     angle = judge.without.angle + 0.1  # normals that were estimated may be wrong
     distances = {-0.5: 0.98 * judge.without.distance, -1.0: few}
 
-    def errors(siren: Siren) -> Each:
+    def errors(siren: Siren) -> Any:
         distance = distances[float(siren.output.bias.detach())]
-        return Each(judge.data * distance.square(), distance, angle, torch.ones_like(distance))
+        return judge.without._replace(loss=judge.data * distance.square(), distance=distance, angle=angle)
 
     monkeypatch.setattr(judge, "errors", errors)
     for bias, done in ((-0.5, 0.5), (-1.0, 1.0)):
-        torch.nn.init.constant_(level.siren.output.bias, bias)
-        level.look(done)
-    assert not judge.surely_less(errors(level.siren)._replace(loss=judge.without.loss), errors(level.siren))
-    verdict = level.take_best()
+        torch.nn.init.constant_(learner.siren.output.bias, bias)
+        learner.look(done)
+    assert not judge.surely_less(errors(learner.siren)._replace(loss=judge.without.loss), errors(learner.siren))
+    verdict = learner.take_best()
     assert verdict.at == (1.0 if guessed else 0.5)
     assert verdict.better == guessed
 
@@ -223,21 +205,16 @@ def test_a_level_is_kept_if_it_is_surely_better() -> None:
         assert not any(verdict_of(*falls)._replace(**known).better for falls in silenced)
 
 
-def test_a_verdict_in_words() -> None:
-    kept, late, worse = verdict_of(3.0, 2.5), verdict_of(3.0, 0.0, 0.5), verdict_of(3.0, -3.0)
-    for verdict, judged, sure in (
-        (kept, "kept", "surely less"),
-        (late, "kept as it was after 50% of its steps", "no sure difference"),
-        (worse, "set to zero", "surely more"),
-    ):
-        words = verdict.words(2, scale=10.0)
-        assert words.startswith(f"level 2 {judged}: ")
-        assert "distance 0.1 → 0.02 (surely less)" in words
-        assert words.endswith(f"3 → 1.5° ({sure})")
+def test_a_verdict_in_words_and_numbers() -> None:
+    verdict = verdict_of(3.0, 0.0, 0.5)
+    words = verdict.words(2, scale=10.0)
+    for part in ("level 2", "50% of its steps", "distance 0.1 → 0.02 (surely less)", "3 → 1.5° (no sure difference)"):
+        assert part in words
     assert "0.70" in verdict_of(1.5, 1.5)._replace(learnt=0.7).words(1)
-    record = worse.record(1, scale=10.0)
-    assert (record["before"], record["after"], record["distance"], record["angle"]) == (2, 1, [0.1, 0.02], [3.0, 1.5])
-    assert record["fall_in_standard_errors"] == {"distance": 3.0, "angle": -3.0}
+    record = verdict.record(1, scale=10.0)
+    assert (record["before"], record["after"]) == (2, 1)
+    assert (record["distance"], record["angle"]) == ([0.1, 0.02], [3.0, 1.5])
+    assert record["fall_in_standard_errors"] == {"distance": 3.0, "angle": 0.0}
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
@@ -247,17 +224,8 @@ def test_no_level_of_a_fit_is_worse_at_held_out_points_than_the_one_before(noise
     x = directions * (0.5 + noise * random.normal(size=(4000, 1)))
     tilted = directions + 10 * noise * random.normal(size=(4000, 3))  # of noisy points the normals are noisy too
     normals = tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
-    config = FitConfig(
-        widths=(24, 64),
-        depths=(2, 2),
-        omegas=(8.0, 80.0),
-        steps=(150, 60),
-        learning_rates=(4e-3, 4e-3),
-        batch=1024,
-        samples=5000,
-        smooth_noise=False,
-        drop_outliers=False,
-    )
+    levels = {"widths": (24, 64), "omegas": (8.0, 80.0), "steps": (150, 60), "learning_rates": (4e-3, 4e-3)}
+    config = replace(SMALL, **levels, samples=5000, smooth_noise=False, drop_outliers=False)
     run = fit(PointCloud(x, normals.astype(np.float32), None, "ball"), config, out=tmp_path / "run")
     stage = run.record["stages"][1]
     judged = stage["held_out"]

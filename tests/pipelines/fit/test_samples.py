@@ -3,30 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from mplicits.datasets import sample_torus
+from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
 from mplicits.neural_fields import Field, MultiscaleSDF, Siren, Sphere, Torus, Union
 from mplicits.neural_fields.fields.primitives import Evaluated
+from mplicits.pipelines.fit import samples as module
 from mplicits.pipelines.fit.cloud import CLOUD, CloudDistance
-from mplicits.pipelines.fit.samples import (
-    BAND,
-    LEAST,
-    SAMPLING,
-    SQUARES,
-    Band,
-    Samples,
-    Weights,
-    band_of,
-    band_samples,
-    banded_sources,
-    delta_of,
-    distance_samples,
-    free_lengths,
-    near_samples,
-    offset_samples,
-    remote_samples,
-    usual_errors,
-    with_previous,
-    with_wrong_sides,
-)
 from mplicits.pipelines.training.settings import FitConfig
 from torch import Tensor
 
@@ -37,17 +19,21 @@ CPU = torch.device("cpu")
 
 
 def sphere_points(count: int, radius: float = RADIUS) -> tuple[Tensor, Tensor]:
-    """Nearly uniform points on a sphere (a Fibonacci lattice) and their normals."""
-    i = torch.arange(count, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
-    flat = (1 - z**2).sqrt()
-    normals = torch.stack((flat * turn.cos(), flat * turn.sin(), z), 1)
-    return (radius * normals).float(), normals.float()
+    """Nearly uniform points on a sphere, and their normals."""
+    normals = torch.from_numpy(fibonacci_directions(count)).float()
+    return radius * normals, normals
 
 
 @pytest.fixture(scope="module")
 def cloud() -> CloudDistance:
     return CloudDistance(*sphere_points(20_000))
+
+
+def sphere_below(top: float, count: int = 20_000, **options: float) -> CloudDistance:
+    """A sphere whose cap above ``top`` of its radius was not scanned."""
+    points, normals = sphere_points(count)
+    seen = normals[:, 2] < top
+    return CloudDistance(points[seen], normals[seen], **options)
 
 
 def generator() -> torch.Generator:
@@ -59,8 +45,7 @@ def test_spacing_and_distance_of_a_sphere(cloud: CloudDistance) -> None:
     assert cloud.areas.sum() == pytest.approx(area, rel=0.1)
     assert cloud.spacing == pytest.approx((area / 20_000) ** 0.5, rel=0.1)
     x = 2 * torch.rand(20_000, 3, generator=generator()) - 1
-    expected = x.norm(dim=1) - RADIUS
-    found = cloud.signed(x)
+    expected, found = x.norm(dim=1) - RADIUS, cloud.signed(x)
     clear = expected.abs() > 1e-4
     assert torch.equal(found.sign()[clear], expected.sign()[clear])
     assert (found - expected).abs().max() < 2e-3
@@ -69,30 +54,25 @@ def test_spacing_and_distance_of_a_sphere(cloud: CloudDistance) -> None:
     assert (found - expected).abs().mean() < 0.3 * (nearest - expected.abs()).abs().mean()
 
 
-def test_winding_number_tells_inside_from_outside_through_a_hole() -> None:
+def test_winding_numbers_tell_inside_from_outside_through_a_hole() -> None:
     points, normals = sphere_points(20_000)
     open_below = points[:, 2] > -0.9 * RADIUS
     cloud = CloudDistance(points[open_below], normals[open_below])
     x = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -0.4], [0.0, 0.0, -0.9], [0.7, 0.0, 0.0], [0.3, 0.3, 0.0]])
-    winding = cloud.winding_number(x.numpy())
-    assert (winding[[0, 1, 4]] > 0.5).all()
-    assert (winding[[2, 3]] < 0.5).all()
-    assert torch.equal(cloud.signed(x) < 0, torch.tensor([True, True, False, False, True]))
+    inside = [True, True, False, False, True]
+    assert (cloud.winding_number(x.numpy()) > 0.5).tolist() == inside
+    assert (cloud.signed(x) < 0).tolist() == inside
 
 
 def test_beside_the_rim_of_a_hole_discs_that_agree_go_on_where_the_surface_ends() -> None:
     """A bowl: in its opening winding numbers are one half, whatever is beside the rim."""
-    points, normals = sphere_points(40_000)
-    below = points[:, 2] < 0
-    bowl = CloudDistance(points[below], normals[below])
+    bowl = sphere_below(0.0, 40_000)
     beside = torch.tensor([[0.95, 0.0, 0.03], [0.0, 0.95, 0.03], [-0.92, 0.0, 0.05]]) * RADIUS  # within the sphere
-    winding = bowl.winding_number(beside.numpy())
-    assert (winding < 0.5).all()
-    assert (winding > 0.5 - CLOUD.doubt).all()
+    doubt = 0.5 - bowl.winding_number(beside.numpy())
+    assert ((doubt > 0) & (doubt < CLOUD.doubt)).all()
     assert (bowl.signed(beside) < 0).all()
     # Not of points that fill a sparse cloud in, which may go on beyond an edge.
-    filled = CloudDistance(points[below], normals[below], given=1)
-    assert (filled.signed(beside) > 0).all()
+    assert (sphere_below(0.0, 40_000, given=1).signed(beside) > 0).all()
     # Beyond the rim's reach, and where its discs are seen edge-on, nothing is better than winding numbers.
     remote = torch.tensor([[0.1, 0.0, 0.05], [0.0, 0.5, -0.05]]) * RADIUS
     turn = torch.linspace(0, 2 * np.pi, 50)
@@ -102,7 +82,7 @@ def test_beside_the_rim_of_a_hole_discs_that_agree_go_on_where_the_surface_ends(
 
 
 def test_distance_samples_cover_the_domain_and_the_surface(cloud: CloudDistance) -> None:
-    samples = distance_samples(cloud, 4000, generator=generator())
+    samples = module.distance_samples(cloud, 4000, generator=generator())
     assert len(samples) == 4000
     assert samples.points.abs().max() <= 1.05
     torch.testing.assert_close(samples.distance, samples.points.norm(dim=1) - RADIUS, rtol=0, atol=2e-3)
@@ -116,18 +96,20 @@ def test_free_lengths_stop_halfway_to_the_next_sheet() -> None:
     outer, outer_normals = sphere_points(20_000, 0.6)
     cloud = CloudDistance(torch.cat((inner, outer)), torch.cat((-inner_normals, outer_normals)))
     rows = np.arange(40_000)
-    outward, inward = (free_lengths(cloud, 0.08, rows, np.full(40_000, side), steps=16) for side in (False, True))
+    outward, inward = (
+        module.free_lengths(cloud, 0.08, rows, np.full(40_000, side), steps=16) for side in (False, True)
+    )
     some = np.array([39_999, 3, 3, 25_000])
     ways = np.array([True, False, True, False])
     expected = torch.stack((outward, inward))[ways.astype(int), some]
-    torch.testing.assert_close(free_lengths(cloud, 0.08, some, ways, steps=16), expected)
+    torch.testing.assert_close(module.free_lengths(cloud, 0.08, some, ways, steps=16), expected)
     assert inward.min() >= 0.04
     assert inward.max() <= 0.06  # the test of 0.9 t allows 0.0526
     assert (outward[20_000:] == 0.08).all()
 
 
 def test_offset_samples_have_the_distance_and_normal_they_claim(cloud: CloudDistance) -> None:
-    samples = offset_samples(cloud, 0.05, 5000, generator=generator())
+    samples = module.offset_samples(cloud, 0.05, 5000, generator=generator())
     jet = Sphere(radius=RADIUS).jet(samples.points)
     torch.testing.assert_close(samples.distance, jet.value, rtol=0, atol=1e-5)
     torch.testing.assert_close(samples.normal, jet.gradient, rtol=0, atol=1e-4)
@@ -137,8 +119,8 @@ def test_offset_samples_have_the_distance_and_normal_they_claim(cloud: CloudDist
 
 def test_band_samples_are_rejected_outside_the_band(cloud: CloudDistance) -> None:
     delta = 0.03
-    raw = band_samples(cloud, delta, 8000, generator=generator())
-    kept = with_previous(raw, Sphere(radius=RADIUS), delta, device=CPU)
+    raw = module.band_samples(cloud, delta, 8000, generator=generator())
+    kept = module.with_previous(raw, Sphere(radius=RADIUS), delta, device=CPU)
     assert raw.distance is None
     assert 0.3 < len(kept) / len(raw) < 0.9
     assert (kept.value.abs() < delta).all()
@@ -152,19 +134,15 @@ def test_previous_levels_reject_by_every_band() -> None:
         for parameter in field.levels[1].parameters():
             parameter.zero_()
     x = 2 * torch.rand(5000, 3, generator=generator()) - 1
-    kept = with_previous(Samples(x), field, 0.2, device=CPU)  # the second band is wider than the first
+    kept = module.with_previous(module.Samples(x), field, 0.2, device=CPU)  # the second band is wider than the first
     assert len(kept) == int(((x.norm(dim=1) - RADIUS).abs() < 0.05).sum())
 
 
 def test_signed_distance_of_a_torus_cloud() -> None:
-    torus = Torus(major=0.6, minor=0.25)
-    u, v = 2 * np.pi * torch.rand(2, 40_000, generator=generator())
-    rho = 0.6 + 0.25 * v.cos()
-    points = torch.stack((rho * u.cos(), rho * u.sin(), 0.25 * v.sin()), 1)
-    cloud = CloudDistance(points, torus.jet(points).gradient)
+    torus, sampled = Torus(major=0.6, minor=0.25), sample_torus(40_000, major=0.6, minor=0.25)
+    cloud = CloudDistance(torch.from_numpy(sampled.points).float(), torch.from_numpy(sampled.normals))
     x = 2 * torch.rand(5000, 3, generator=generator()) - 1
-    expected = torus.value(x)
-    found = cloud.signed(x)
+    expected, found = torus.value(x), cloud.signed(x)
     clear = expected.abs() > 0.01
     assert torch.equal(found.sign()[clear], expected.sign()[clear])
     assert (found - expected).abs().mean() < 1e-3
@@ -216,15 +194,15 @@ def test_a_normal_with_the_wrong_sign_counts_as_much_as_others() -> None:
     flipped, others = (float(cloud.areas[some.numpy()].mean()) for some in (wrong, ~wrong))
     assert flipped < 1.2 * others
     x = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.8 * RADIUS], [0.0, 0.0, 1.2 * RADIUS]])
-    assert torch.equal(cloud.signed(x) < 0, torch.tensor([True, True, False]))
+    assert (cloud.signed(x) < 0).tolist() == [True, True, False]
 
 
 FAR = 0.02  # of leaves of dipoles, each seen as one
 PHANTOM = Sphere(radius=0.1, center=(0.85, 0.0, 0.0))
 
 
-def empty(cloud: CloudDistance, field: Sphere | Union, delta: float = 0.05) -> Samples:
-    return remote_samples(cloud, field, delta, 40_000, generator=generator(), device=CPU).empty
+def empty(cloud: CloudDistance, field: Sphere | Union, delta: float = 0.05) -> module.Samples:
+    return module.remote_samples(cloud, field, delta, 40_000, generator=generator(), device=CPU).empty
 
 
 def test_a_sound_level_has_no_empty_places_in_its_band(cloud: CloudDistance) -> None:
@@ -243,73 +221,65 @@ def test_empty_places_are_where_a_level_invents_a_surface(cloud: CloudDistance) 
     assert (exact - found.value.abs() > 0.045).all()
 
 
-def with_hole() -> CloudDistance:
-    """A sphere whose cap above z = 0.8 of its radius was not scanned."""
-    points, normals = sphere_points(20_000)
-    seen = normals[:, 2] < 0.8
-    return CloudDistance(points[seen], normals[seen])
-
-
 def test_places_in_less_doubt_are_empty_where_normals_are_guesses() -> None:
     """In the mouth of a bowl the winding number is between; guesses are believed from 0.2 and 0.8 on."""
-    points, normals = sphere_points(20_000)
-    seen = normals[:, 2] < 0.3
     level, found = Sphere(radius=RADIUS), {}
     for guessed in (False, True):
-        bowl = CloudDistance(points[seen], normals[seen], guessed=guessed)
-        found[guessed] = remote_samples(bowl, level, 0.05, 40_000, generator=generator(), device=CPU)
+        bowl = sphere_below(0.3, guessed=guessed)
+        found[guessed] = module.remote_samples(bowl, level, 0.05, 40_000, generator=generator(), device=CPU)
         for places, sure in ((found[guessed].empty, True), (found[guessed].unseen, False)):
             depth = np.abs(bowl.winding_number(places.points.numpy()) - 0.5)
-            # Which dipoles count one by one depends on which places are asked for together.
-            least = (SAMPLING.sure_guessed if guessed else SAMPLING.sure) + (-FAR if sure else FAR)
+            # Which dipoles count one by one depends on the places of one call.
+            least = (module.SAMPLING.sure_guessed if guessed else module.SAMPLING.sure) + (-FAR if sure else FAR)
             assert ((depth > least) == sure).all()
     assert len(found[True].empty) > len(found[False].empty)
     assert len(found[True].unseen) < len(found[False].unseen)
 
 
-def test_a_level_is_to_keep_what_nobody_has_seen(cloud: CloudDistance) -> None:
+def test_a_level_keeps_what_was_not_scanned(cloud: CloudDistance) -> None:
     """In the hole, and only there, more than δ from its rim, with the value of the level before."""
     level, delta = Sphere(radius=RADIUS - 0.01), 0.05
-    assert len(empty(with_hole(), Sphere(radius=RADIUS))) == 0
-    found = remote_samples(with_hole(), level, delta, 40_000, generator=generator(), device=CPU).unseen
+    assert len(empty(sphere_below(0.8), Sphere(radius=RADIUS))) == 0
+    found = module.remote_samples(sphere_below(0.8), level, delta, 40_000, generator=generator(), device=CPU).unseen
     assert len(found) > 1000
     assert torch.equal(found.distance, level.value(found.points))
     up = found.points[:, 2] / found.points.norm(dim=1)
     rim = np.cos(np.arccos(0.8) - np.arcsin(delta / (RADIUS + delta)))  # δ away from it, outside at the most
     assert (up > rim - 0.01).all()
     assert up.max() > 0.999
-    whole = remote_samples(cloud, level, delta, 40_000, generator=generator(), device=CPU)
+    whole = module.remote_samples(cloud, level, delta, 40_000, generator=generator(), device=CPU)
     assert len(whole.unseen) == len(whole.empty) == 0
+
+
+def with_next_level(cloud: CloudDistance, previous: MultiscaleSDF, omega: float, steps: int) -> tuple[list[str], Field]:
+    """Names of the sources of the level above ``previous``, and the field with it, trained for a moment."""
+    levels = {"widths": (8, 48), "depths": (1, 1), "omegas": (30.0, omega), "learning_rates": (1e-3, 2e-3)}
+    config = FitConfig(**levels, steps=(1, steps), batch=1500)
+    sources = module.banded_sources(cloud, previous, 0.05, config, generator=generator())
+    torch.manual_seed(0)
+    siren = train_level(1, sources, config, generator=generator())
+    return [source.name for source in sources], previous.with_level(siren, delta=0.05)
 
 
 @pytest.mark.slow
 def test_the_next_level_leaves_the_closing_of_a_hole_as_it_is() -> None:
-    config = FitConfig(
-        widths=(8, 48), depths=(1, 1), omegas=(30.0, 40.0), steps=(1, 100), learning_rates=(1e-3, 2e-3), batch=1500
-    )
-    cloud, delta = with_hole(), 0.05
-    previous = MultiscaleSDF(Sphere(radius=RADIUS + 0.02), [], [])  # wrong by 0.02 where there are points
-    sources = banded_sources(cloud, previous, delta, config, generator=generator())
-    assert [source.name for source in sources] == ["surface", "offset", "band", "unseen"]
-    torch.manual_seed(0)
-    field = previous.with_level(train_level(1, sources, config, generator=generator()), delta=delta)
-    cap = torch.nn.functional.normalize(
-        torch.randn(500, 3, generator=generator()) * torch.tensor([0.1, 0.1, 0.0]), dim=1
-    )
-    cap = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.rand(500, 1) * cap, dim=1)
+    cloud, previous = (
+        sphere_below(0.8),
+        MultiscaleSDF(Sphere(radius=RADIUS + 0.02), [], []),
+    )  # off by 0.02 at the points
+    names, field = with_next_level(cloud, previous, 40.0, 100)
+    assert names == ["surface", "offset", "band", "unseen"]
+    aside = torch.nn.functional.normalize(torch.randn(500, 2, generator=generator()), dim=1)
+    cap = torch.cat((0.2 * torch.rand(500, 1) * aside, torch.ones(500, 1)), dim=1)
+    cap = torch.nn.functional.normalize(cap, dim=1)
     assert (field.value(cap * (RADIUS + 0.02))).abs().max() < 0.005
     assert field.value(torch.from_numpy(cloud.points)).abs().mean() < 0.005
 
 
 def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> None:
-    config = FitConfig(
-        widths=(8, 48), depths=(1, 1), omegas=(30.0, 20.0), steps=(1, 150), learning_rates=(1e-3, 2e-3), batch=1500
-    )
-    previous, delta = MultiscaleSDF(Union(Sphere(radius=RADIUS), PHANTOM), [], []), 0.05
-    sources = banded_sources(cloud, previous, delta, config, generator=generator())
-    assert [source.name for source in sources] == ["surface", "offset", "band", "empty"]
-    torch.manual_seed(0)
-    field = previous.with_level(train_level(1, sources, config, generator=generator()), delta=delta)
+    previous = MultiscaleSDF(Union(Sphere(radius=RADIUS), PHANTOM), [], [])
+    names, field = with_next_level(cloud, previous, 20.0, 150)
+    assert names == ["surface", "offset", "band", "empty"]
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator()), dim=1)
     shell = torch.tensor([0.85, 0.0, 0.0]) + 0.1 * directions
     outside = shell[shell.norm(dim=1) > RADIUS + 0.1]
@@ -318,12 +288,12 @@ def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> 
     assert field.value(torch.from_numpy(cloud.points)).square().mean().sqrt() < 0.01
 
 
-def test_near_a_cloud_of_guessed_normals_all_of_them_together_say_the_side() -> None:
+def test_near_a_cloud_of_guessed_normals_winding_numbers_tell_the_side() -> None:
     """One in eight points inward, and its offsets would be on the wrong side; inside the winding number is 3/4."""
     points, normals = sphere_points(20_000)
     normals = torch.where((torch.arange(20_000) % 8 == 0)[:, None], -normals, normals)
     cloud, delta = CloudDistance(points, normals, noise=0.01, guessed=True), 0.05
-    samples = near_samples(cloud, delta, 2000, generator=generator())
+    samples = module.near_samples(cloud, delta, 2000, generator=generator())
     assert samples.normal is None
     exact = samples.points.norm(dim=1) - RADIUS
     assert exact.abs().max() <= 3**0.5 * delta * (1 + 1e-6)  # of a cube of half-edge δ around a point
@@ -333,22 +303,21 @@ def test_near_a_cloud_of_guessed_normals_all_of_them_together_say_the_side() -> 
     assert (samples.distance.sign() != exact.sign())[clear].float().mean() < 0.1 / 8
     assert (samples.distance.abs() - exact.abs()).abs().max() < cloud.spacing
 
-    config = FitConfig(samples=8000)
-    sources = banded_sources(cloud, Sphere(radius=RADIUS - 0.01), delta, config, generator=generator())
+    config, previous = FitConfig(samples=8000), Sphere(radius=RADIUS - 0.01)
+    sources = module.banded_sources(cloud, previous, delta, config, generator=generator())
     assert [source.name for source in sources] == ["surface", "near", "band"]
-    assert {(source.normal, source.eikonal) for source in sources} == {
-        (0.1 * config.normal_weight, 0.2 * config.eikonal_weight)
-    }
-    fixed = Weights(normal=1.0, eikonal=2.0)
-    sources = banded_sources(cloud, Sphere(radius=RADIUS - 0.01), delta, config, generator=generator(), weights=fixed)
+    weights = 0.1 * config.normal_weight, 0.2 * config.eikonal_weight
+    assert {(source.normal, source.eikonal) for source in sources} == {weights}
+    fixed = module.Weights(normal=1.0, eikonal=2.0)
+    sources = module.banded_sources(cloud, previous, delta, config, generator=generator(), weights=fixed)
     assert {(source.normal, source.eikonal) for source in sources} == {(1.0, 2.0)}
 
 
-@pytest.mark.parametrize(("guessed", "left"), [(True, SAMPLING.left), (False, 1.0)])
+@pytest.mark.parametrize(("guessed", "left"), [(True, module.SAMPLING.left), (False, 1.0)])
 def test_distances_are_weighed_by_the_noise_that_is_left(guessed: bool, left: float) -> None:
     cloud, config = CloudDistance(*sphere_points(2000), noise=0.01, guessed=guessed), FitConfig()
     for error, square, noise in ((1e-3, 0.0, left * 0.01), (0.1, 0.01, 0.0)):  # far below the noise, and far above
-        weight = Weights().resolved(config, torch.full((2000,), error), cloud)[0]
+        weight = module.Weights().resolved(config, torch.full((2000,), error), cloud)[0]
         assert weight == pytest.approx(config.data_weight_after(square, noise))
 
 
@@ -359,9 +328,9 @@ def test_usual_errors_are_those_of_the_smooth_places() -> None:
     # A quarter of them, as beside edges: the medians stay.
     angle[751:], off[751:] = np.deg2rad(40), 0.09
     tilted = angle.cos()[:, None] * normals + angle.sin()[:, None] * across
-    surface = with_previous(Samples(points, off, tilted), Sphere(radius=RADIUS), 0.1, device=CPU)
-    band = Samples(points, gradient=normals * (1 + torch.linspace(0, 0.2, 1001))[:, None])
-    usual = usual_errors(surface, band)
+    surface = module.with_previous(module.Samples(points, off, tilted), Sphere(radius=RADIUS), 0.1, device=CPU)
+    band = module.Samples(points, gradient=normals * (1 + torch.linspace(0, 0.2, 1001))[:, None])
+    usual = module.usual_errors(surface, band)
     assert usual.data == pytest.approx(0.01**2, rel=1e-3)
     assert usual.normal == pytest.approx(1 - np.cos(np.deg2rad(4)), rel=2e-3)  # float32 rounds by 6e-8 of 2e-3
     assert usual.eikonal == pytest.approx(0.1**2, rel=1e-3)
@@ -371,67 +340,69 @@ def test_usual_errors_are_those_of_the_smooth_places() -> None:
 def test_the_scales_of_errors_are_those_of_the_level_before(robust: bool) -> None:
     index = CloudDistance(*sphere_points(2000))
     config = FitConfig(samples=2000, robust_normals=robust)
-    sources = banded_sources(index, Sphere(radius=RADIUS - 0.01), 0.05, config, generator=generator())
+    sources = module.banded_sources(index, Sphere(radius=RADIUS - 0.01), 0.05, config, generator=generator())
     # The normals of the spheres are alike, their gradients of length 1. The first residual squares its distances.
-    expected = (np.inf, *LEAST[1:]) if robust else SQUARES
+    expected = (np.inf, *module.LEAST[1:]) if robust else module.SQUARES
     assert [tuple(source.usual) for source in sources] == [tuple(expected)] * 3
     nothing = Siren(8, 2, omega=10.0)
     torch.nn.init.zeros_(nothing.output.weight)
     torch.nn.init.zeros_(nothing.output.bias)
     two = MultiscaleSDF(Sphere(radius=RADIUS - 0.01), [nothing], [0.05])
-    sources = banded_sources(index, two, 0.05, config, generator=generator())
+    sources = module.banded_sources(index, two, 0.05, config, generator=generator())
     assert sources[0].usual.data == (pytest.approx(1e-4, rel=1e-4) if robust else np.inf)
 
 
-def test_delta_is_equation_5() -> None:
-    errors = torch.tensor([0.01, -0.02, 0.005, 0.0])
-    assert delta_of(errors, epsilon=0.3, quantile=1.0) == pytest.approx(1.3 * 0.02)
-    assert delta_of(errors, epsilon=0.3, quantile=0.75) == pytest.approx(1.3 * 0.01)
-    stray = torch.cat((torch.full((9999,), 0.01), torch.tensor([1.0])))
-    assert delta_of(stray, epsilon=0.3, quantile=1.0) == pytest.approx(1.3)
-    for quantile in (0.999, None):
-        assert delta_of(stray, epsilon=0.3, quantile=quantile) == pytest.approx(1.3 * 0.01)
-    normal = torch.randn(50_000, generator=torch.Generator().manual_seed(0))
-    assert delta_of(normal, epsilon=0.3, quantile=None) == pytest.approx(1.3 * float(normal.abs().max()))
+FOUR = torch.tensor([0.01, -0.02, 0.005, 0.0])
+STRAY = torch.cat((torch.full((9999,), 0.01), torch.tensor([1.0])))
+# More than one in a hundred: the 99th percentile is itself a stray's.
+STRAYS = torch.cat((torch.linspace(0, 0.01, 9500), torch.linspace(0.4, 1, 500)))
+NORMAL = torch.randn(50_000, generator=generator())
 
 
-def test_many_strays_do_not_widen_a_band() -> None:
-    """More than one in a hundred: the 99th percentile is itself a stray's."""
-    strays = torch.cat((torch.linspace(0, 0.01, 9500), torch.linspace(0.4, 1, 500)))
-    band = band_of(strays, epsilon=0.3, quantile=None)
-    assert band.delta == pytest.approx(1.3 * 0.01)
-    assert (band.rule, band.outside) == ("maximum but for strays", 500)
+@pytest.mark.parametrize(
+    ("errors", "quantile", "largest", "rule", "outside"),
+    [
+        (FOUR, 1.0, 0.02, "quantile", 0),
+        (FOUR, 0.75, 0.01, "quantile", 1),
+        (FOUR, None, 0.02, "maximum", 0),
+        (STRAY, 1.0, 1.0, "quantile", 0),
+        (STRAY, 0.999, 0.01, "quantile", 1),
+        (STRAY, None, 0.01, "maximum but for strays", 1),
+        (STRAYS, None, 0.01, "maximum but for strays", 500),
+        (NORMAL, None, float(NORMAL.abs().max()), "maximum", 0),
+        (torch.zeros(5), None, 1e-6 / 1.3, "maximum", 0),
+    ],
+)
+def test_delta_is_equation_5(errors: Tensor, quantile: float | None, largest: float, rule: str, outside: int) -> None:
+    band = module.band_of(errors, epsilon=0.3, quantile=quantile)
+    assert band.delta == pytest.approx(1.3 * largest)
+    assert (band.rule, band.outside) == (rule, outside)
 
 
-def test_bands_say_what_chose_them() -> None:
-    errors = torch.tensor([0.01, -0.02, 0.005, 0.0])
-    assert band_of(errors, epsilon=0.3, quantile=None).rule == "maximum"
-    by_quantile = band_of(errors, epsilon=0.3, quantile=0.75)
-    assert (by_quantile.rule, by_quantile.outside) == ("quantile", 1)
-    assert band_of(torch.zeros(5), epsilon=0.3, quantile=None).delta == 1e-6
-    assert by_quantile.within(None, errors) is by_quantile
-    assert by_quantile.within(0.07, errors) is by_quantile
-    assert by_quantile.within(0.006, errors) == Band(0.006, "no wider than the band before", 2)
+def test_a_band_is_no_wider_than_the_one_before() -> None:
+    band = module.band_of(FOUR, epsilon=0.3, quantile=0.75)
+    assert band.within(None, FOUR) is band.within(0.07, FOUR) is band
+    assert band.within(0.006, FOUR) == module.Band(0.006, "no wider than the band before", 2)
 
 
-def widened(field: Field, delta: float) -> Band:
+def widened(field: Field, delta: float) -> module.Band:
     """The band of a field that was fitted to a sphere of radius 0.5."""
     cloud = CloudDistance(*sphere_points(10_000, 0.5))
-    where = {"count": 400_000, "seed": 0, "device": CPU}
-    return with_wrong_sides(Band(delta, "maximum", 1), torch.tensor([delta]), cloud, field, epsilon=0.05, **where)
+    band, options = module.Band(delta, "maximum", 1), {"epsilon": 0.05, "count": 400_000, "seed": 0, "device": CPU}
+    return module.with_wrong_sides(band, torch.tensor([delta]), cloud, field, **options)
 
 
-def test_a_level_that_is_right_keeps_the_band_of_its_points() -> None:
-    for field in (Sphere(radius=0.5), Sphere(radius=0.52), Sphere(radius=0.48)):
-        assert widened(field, 0.03).delta == 0.03
+@pytest.mark.parametrize("radius", [0.5, 0.52, 0.48])
+def test_a_level_that_is_right_keeps_the_band_of_its_points(radius: float) -> None:
+    assert widened(Sphere(radius=radius), 0.03).delta == 0.03
 
 
 @pytest.mark.parametrize(
     ("delta", "expected"),
-    [(0.12, 1.05 * 0.2), (0.06, BAND.widest * 0.06), pytest.param(0.21, 0.21, marks=pytest.mark.slow)],
+    [(0.12, 1.05 * 0.2), (0.06, module.BAND.widest * 0.06), pytest.param(0.21, 0.21, marks=pytest.mark.slow)],
 )
 def test_a_band_holds_what_a_level_puts_on_the_wrong_side(delta: float, expected: float) -> None:
-    """A ball of radius 0.2 hangs beside the sphere: 0.2 deep. Of the places in it the deepest is asked, nearly."""
+    """A ball of radius 0.2 hangs beside the sphere: 0.2 deep. The deepest place in it decides, nearly."""
     band = widened(Union(Sphere(radius=0.5), Sphere(radius=0.2, center=(0.8, 0.0, 0.0))), delta)
     assert 0.8 * expected < band.delta <= expected * (1 + 1e-6)
     assert (band.rule == "places on the wrong side") == (delta < 0.2)

@@ -1,32 +1,20 @@
 """Signs from points alone, on shapes whose in- and outside is known."""
 
-import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 
+import fits
 import numpy as np
 import pytest
 import torch
 from mplicits.datasets import OrientedCloud, PointCloud, prepare_cloud, sample_sphere, sample_torus
 from mplicits.neural_fields import load_field
+from mplicits.pipelines.fit import FitConfig, Interrupted, fit, prepare
 from mplicits.pipelines.fit.cloud import CloudDistance
-from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.fit.unoriented import SIGNING, STAGES, Places, Signs, fits_better, give_signs
-from mplicits.pipelines.training.settings import FitConfig
-from mplicits.pipelines.training.trainer import Interrupted, Progress
 from torch import Tensor
 
-SMALL = FitConfig(
-    widths=(32, 48),
-    depths=(2, 2),
-    omegas=(20.0, 20.0),
-    steps=(100, 30),
-    learning_rates=(3e-3, 1e-3),
-    batch=1024,
-    samples=20_000,
-    normals="none",
-)
+SMALL = replace(fits.SMALL, omegas=(20.0, 20.0), steps=(100, 30), normals="none")
 CPU = torch.device("cpu")
 # Of a smooth surface no point needs to be wrong; what noise there is in the evidence may spoil one in a hundred.
 FEW = 0.01
@@ -47,6 +35,16 @@ def ball(count: int, radius: float, *, inward: bool = False) -> tuple[Tensor, Te
 
 def joined(*parts: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     return torch.cat([points for points, _ in parts]), torch.cat([normals for _, normals in parts])
+
+
+def prepared(part: tuple[Tensor, Tensor]) -> OrientedCloud:
+    points, normals = part
+    return prepare_cloud(PointCloud(points.double().numpy(), normals.numpy()), normals="file")
+
+
+def turned(cloud: OrientedCloud, which: np.ndarray) -> OrientedCloud:
+    """With some of the normals turned round."""
+    return replace(cloud, normals=np.where(which[:, None], -cloud.normals, cloud.normals))
 
 
 def scrambled(normals: Tensor) -> tuple[Tensor, np.ndarray]:
@@ -76,27 +74,24 @@ def test_the_hollow_of_a_thick_wall_is_outside_though_normals_filled_it() -> Non
 
 
 def test_signs_are_taken_where_winding_numbers_fit_better_with_them() -> None:
-    points, normals = joined(ball(2500, 0.8), ball(1500, 0.6, inward=True))
-    cloud = prepare_cloud(PointCloud(points.double().numpy(), normals.numpy(), None, "shell"), normals="file")
+    cloud = prepared(joined(ball(2500, 0.8), ball(1500, 0.6, inward=True)))
     inner = np.arange(len(cloud)) >= 2500
-    filled = replace(cloud, normals=np.where(inner[:, None], -cloud.normals, cloud.normals))
+    filled = turned(cloud, inner)
     assert fits_better(filled, Signs(inner, 1.0, "exterior"))
     assert not fits_better(cloud, Signs(inner, 1.0, "exterior"))
     some = np.random.default_rng(0).uniform(size=len(cloud)) < 0.07
     assert not fits_better(cloud, Signs(some, 1.0, "winding"))
-    spotted = replace(cloud, normals=np.where(some[:, None], -cloud.normals, cloud.normals))
+    spotted = turned(cloud, some)
     assert fits_better(spotted, Signs(some, 1.0, "winding"))
     assert not fits_better(spotted, Signs(some != inner, 1.0, "winding"))  # a filled hollow costs more than spots
     assert not fits_better(cloud, Signs(np.zeros(len(cloud), bool), 1.0, "winding"))
 
 
-def test_a_small_patch_is_turned_though_the_rest_of_a_large_cloud_hardly_knows() -> None:
-    points, normals = ball(20_000, 0.8)
-    cloud = prepare_cloud(PointCloud(points.double().numpy(), normals.numpy(), None, "ball"), normals="file")
+def test_a_small_patch_of_a_large_cloud_is_turned() -> None:
+    cloud = prepared(ball(20_000, 0.8))
     patch = cloud.points[:, 2] > 0.995 * cloud.points[:, 2].max()
     assert 0 < patch.mean() < 0.005
-    wrong = replace(cloud, normals=np.where(patch[:, None], -cloud.normals, cloud.normals))
-    assert fits_better(wrong, Signs(patch, 1.0, "winding"))
+    assert fits_better(turned(cloud, patch), Signs(patch, 1.0, "winding"))
     assert not fits_better(cloud, Signs(patch, 1.0, "winding"))
 
 
@@ -110,38 +105,25 @@ def test_of_an_open_sheet_all_stays() -> None:
     assert not found.turned.any()
 
 
-def spoilt(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
-    """Prepared, with every second normal turned round."""
-    good = prepare(cloud, config)
-    sign = np.where(np.arange(len(good)) % 2, 1, -1).astype(np.float32)
-    return replace(good, normals=good.normals * sign[:, None])
-
-
 def test_a_fit_without_normals(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Nobody knows a sign, and the field is the torus all the same; interrupted anywhere, it comes out the same."""
+    """No sign is known, and the field is the torus all the same; interrupted anywhere, it comes out the same."""
+
+    def spoilt(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
+        good = prepare(cloud, config)
+        return turned(good, np.arange(len(good)) % 2 == 0)
+
     monkeypatch.setattr("mplicits.pipelines.fit.train.prepare", spoilt)
     cloud = PointCloud(sample_torus(2000, major=0.6, minor=0.25).points)
-    told: list[Progress] = []
     config = replace(SMALL, batch=512, samples=4000)
-    whole = fit(cloud, config, progress=told.append)
-    levels = [f"level {level}{part}" for level in (0, 1) for part in (": samples", "")]
-    stages = ["reading the cloud", "preparing the cloud", *STAGES, *levels]
-    assert list(dict.fromkeys(progress.stage for progress in told)) == stages
-    assert [progress.fraction for progress in told if progress.stage == levels[0]] == [0.0, 1.0]
+    whole = fit(cloud, config)
     assert whole.record["signs"]["turned_normals"] == pytest.approx(1000, abs=FEW * 2000)
     assert whole.record["cleaning"]["oriented_by"] == "level"
     distance = whole.world.distance(np.array([[0.6, 0, 0], [0, 0, 0], [0, -0.6, 0], [1, 1, 1.0]]))
     assert (np.sign(distance) == [-1, 1, -1, 1]).all()
 
     for stage in (STAGES[1], "level 1"):
-
-        def interrupt(progress: Progress, stage: str = stage) -> None:
-            if progress.stage == stage and progress.step == 20:
-                os.kill(os.getpid(), signal.SIGINT)
-
         with pytest.raises(Interrupted, match="checkpoint"):
-            fit(cloud, config, out=tmp_path / stage, progress=interrupt)
+            fit(cloud, config, out=tmp_path / stage, progress=fits.interrupt(stage, 20))
         resumed = fit(cloud, out=tmp_path / stage, resume=True)
         assert resumed.record["signs"] == whole.record["signs"]
-        kept = load_field(tmp_path / stage / "field.safetensors").field.state_dict()
-        assert all(torch.equal(kept[name], tensor) for name, tensor in whole.field.state_dict().items())
+        fits.assert_same(load_field(tmp_path / stage / "field.safetensors").field, whole.field)

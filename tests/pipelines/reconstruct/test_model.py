@@ -6,10 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import look_at
-from mplicits.datasets.views.images import PosedImage
-from mplicits.neural_fields import InputError, MultiscaleSDF, Similarity, Sphere, ViewColor
-from mplicits.neural_fields.networks.neus_mlp import NeusSDF
+from mplicits.datasets import PosedImage, look_at
+from mplicits.neural_fields import InputError, Similarity, Sphere, ViewColor
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.neural_fields.volume.weights import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
@@ -26,16 +24,8 @@ def no_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene_model, "fit_sphere", lambda network, radius: None)
 
 
-def exact_scene() -> SceneModel:
-    return SceneModel(Sphere(radius=0.5), ViewColor(0, width=8, depth=1), None, torch.zeros(3))
-
-
-def parameters(module: torch.nn.Module) -> int:
-    return sum(parameter.numel() for parameter in module.parameters())
-
-
 def test_the_uncertainty_begins_as_in_neus_and_can_be_trained() -> None:
-    model = exact_scene()
+    model = SceneModel(Sphere(radius=0.5), ViewColor(0, width=8, depth=1), None, torch.zeros(3))
     assert float(model.inv_std.detach()) == pytest.approx(math.exp(3), rel=1e-6)
     (slope,) = torch.autograd.grad(model.inv_std, model.variance)
     assert float(slope) == pytest.approx(10 * math.exp(3), rel=1e-5)
@@ -77,11 +67,11 @@ def test_residuals_begin_near_zero() -> None:
 
 @pytest.mark.usefixtures("no_start")
 def test_the_papers_geometry_is_more_than_a_third_smaller_than_that_of_neus() -> None:
-    multiscale = build_scene(PAPER, has_masks=True).geometry
-    neus = build_scene(replace(PAPER, geometry="neus"), has_masks=True).geometry
-    assert isinstance(multiscale, MultiscaleSDF)
-    assert isinstance(neus, NeusSDF)
-    assert parameters(multiscale) <= (1 - 0.37) * parameters(neus)
+    multiscale, neus = (
+        sum(p.numel() for p in build_scene(replace(PAPER, geometry=name), has_masks=True).geometry.parameters())
+        for name in ("multiscale", "neus")
+    )
+    assert multiscale <= (1 - 0.37) * neus
 
 
 @pytest.mark.usefixtures("no_start")
@@ -91,7 +81,6 @@ def test_the_papers_geometry_is_more_than_a_third_smaller_than_that_of_neus() ->
         ("auto", True, False, 1.0),
         ("auto", False, True, 0.0),
         ("black", True, False, 0.0),
-        ("black", False, False, 0.0),
         ("white", False, False, 1.0),
         ("outside", True, True, 0.0),
     ],
@@ -132,7 +121,6 @@ def test_everything_is_trained_by_one_picture(half: bool, monkeypatch: pytest.Mo
     (seen.color.square().mean() + (seen.jet.gradient.norm(dim=-1) - 1).square().mean()).backward()
     missing = [name for name, p in model.named_parameters() if p.grad is None or not bool(p.grad.isfinite().all())]
     assert missing == []
-    assert model.variance.grad is not None
     assert float(model.variance.grad.abs()) > 0
 
 
@@ -155,11 +143,10 @@ def views(*, masked: bool = True) -> list[PosedImage]:
     return [view(0, 14, 9, masked=masked), view(1, 8, 12, masked=masked), view(2, 10, 10, masked=masked, fov=60)]
 
 
-def places(pool: RayPool, count: int = 20_000) -> tuple[list[tuple[int, int, int]], torch.Tensor, torch.Tensor]:
-    """(view, y, x) of drawn rays, their origins and their directions."""
-    rays = pool.draw(count, torch.Generator().manual_seed(1))
-    where = (rays.color * 255).round().long().tolist()
-    return [(number, y, x) for number, y, x in where], rays.origins, rays.directions
+def places(pool: RayPool, count: int = 20_000) -> list[tuple[int, ...]]:
+    """(view, y, x) of drawn rays."""
+    colors = pool.draw(count, torch.Generator().manual_seed(1)).color
+    return [tuple(place) for place in (colors * 255).round().long().tolist()]
 
 
 def test_a_drawn_ray_is_that_of_its_pixel_with_its_colour_and_mask() -> None:
@@ -174,7 +161,6 @@ def test_a_drawn_ray_is_that_of_its_pixel_with_its_colour_and_mask() -> None:
         eye, directions = picture.camera.moved(WORLD).rays()
         torch.testing.assert_close(rays.origins[rows], eye.expand(int(rows.sum()), 3), atol=1e-6, rtol=0)
         torch.testing.assert_close(rays.directions[rows], directions[y[rows], x[rows]], atol=1e-6, rtol=0)
-        assert picture.mask is not None
         mask = torch.from_numpy(picture.mask)[y[rows], x[rows]]
         torch.testing.assert_close(rays.mask[rows], mask, atol=1e-7, rtol=0)
 
@@ -201,7 +187,7 @@ def test_pixels_that_miss_the_sphere_are_never_drawn_and_all_others_are() -> Non
     everything = sum(picture.color.shape[0] * picture.color.shape[1] for picture in pictures)
     assert 0.3 * everything < len(expected) < 0.95 * everything  # a test of both kinds of pixels
     assert len(pool) == len(expected)
-    assert set(places(pool)[0]) == expected
+    assert set(places(pool)) == expected
 
 
 @pytest.mark.parametrize("whole", [False, True])
@@ -209,15 +195,14 @@ def test_pixels_that_are_left_out_are_never_drawn(whole: bool) -> None:
     pictures = views()
     hole = np.zeros(pictures[1].color.shape[:2], dtype=bool)
     hole[3:9, 2:6] = True
-    everything, rest = (places(RayPool(pictures, WORLD, CPU, whole=whole, left_out=out))[0] for out in ({}, {1: hole}))
+    everything, rest = (places(RayPool(pictures, WORLD, CPU, whole=whole, left_out=out)) for out in ({}, {1: hole}))
     assert set(rest) == {(number, y, x) for number, y, x in everything if number != 1 or not hole[y, x]}
     assert len(set(rest)) < len(set(everything))
 
 
 def test_all_pixels_are_equally_likely() -> None:
     pool = RayPool(views(), WORLD, CPU)
-    where, _, _ = places(pool, 100 * len(pool))
-    _, counts = np.unique(np.array(where), axis=0, return_counts=True)
+    _, counts = np.unique(np.array(places(pool, 100 * len(pool))), axis=0, return_counts=True)
     # χ² with n − 1 degrees of freedom is within five standard deviations of its mean.
     excess = ((counts - 100.0) ** 2 / 100).sum() - (len(pool) - 1)
     assert abs(excess) < 5 * (2 * len(pool)) ** 0.5
@@ -227,15 +212,14 @@ def test_without_masks_everything_counts_as_object() -> None:
     pool = RayPool(views(masked=False), WORLD, CPU)
     assert not pool.has_masks
     assert pool.draw(30, torch.Generator()).mask.tolist() == [1.0] * 30
-    # One view without a mask: nobody knows what is object there.
+    # In one view without a mask it is not known what the object is.
     assert not RayPool([*views(), view(0, 14, 9, masked=False)], WORLD, CPU).has_masks
 
 
 def test_cameras_that_all_look_away_are_refused() -> None:
     away = [view(number, 8, 8, masked=True, back=True) for number in range(3)]
-    with pytest.raises(InputError, match="sees the region of interest; see `mplicits check-cameras`"):
-        RayPool(away, WORLD, CPU)
-    with pytest.raises(InputError, match="sees the region of interest"):
-        RayPool(away, WORLD, CPU, whole=True)
+    for whole in (False, True):
+        with pytest.raises(InputError, match="sees the region of interest; see `mplicits check-cameras`"):
+            RayPool(away, WORLD, CPU, whole=whole)
     mixed = RayPool([away[0], *views()[1:]], WORLD, CPU)
-    assert {number for number, _, _ in places(mixed)[0]} == {1, 2}
+    assert {number for number, _, _ in places(mixed)} == {1, 2}

@@ -17,7 +17,6 @@ def test_what_was_held_is_counted_and_stays() -> None:
     size = held.nbytes
     del held
     after = peak_memory()
-    assert after is not None
     # Not one against the other: the kernel counts pages per processor, and adds them up now and then.
     assert min(during, after) > size
 
@@ -27,10 +26,6 @@ def test_a_child_does_not_inherit_its_parents_peak() -> None:
     # Its source in a bare interpreter, which needs some 10 MiB; this one holds 256 MiB more when the child is born.
     program = f"import sys\nfrom pathlib import Path\nSTATUS = Path({str(STATUS)!r})\n{inspect.getsource(peak_memory)}"
     held = np.ones(2**28, np.uint8)
-    child = subprocess.run(
-        [sys.executable, "-S", "-E", "-c", f"{program}\nprint(peak_memory())"],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
+    command = [sys.executable, "-S", "-E", "-c", f"{program}\nprint(peak_memory())"]
+    child = subprocess.run(command, check=True, capture_output=True, text=True)
     assert int(child.stdout) < held.nbytes // 4

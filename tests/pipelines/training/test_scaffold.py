@@ -1,12 +1,11 @@
 """Shares of a time budget, by costs and clocks that the tests choose."""
 
-import json
-from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
 from mplicits.pipelines.training import scaffold as module
-from mplicits.pipelines.training.scaffold import BUDGET, Budget, affordable, step_seconds
+from mplicits.pipelines.training.scaffold import Budget, affordable, step_seconds
 
 STEPS, COSTS = (1000, 500, 500), (0.01, 0.02, 0.04)  # 10 s, 10 s, 20 s
 
@@ -19,70 +18,49 @@ def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return clock
 
 
-def budget_of(seconds: float | None) -> Budget:
-    return Budget(seconds)
-
-
 def test_what_is_left(now: list[float]) -> None:
-    budget = budget_of(10.0)
+    budget = Budget(10.0)
     now[0] += 4.0
     budget.before = 1.0  # of a process that was interrupted
     assert budget.left() == 5.0
     now[0] += 60.0
     assert budget.left() == 0.0
-    assert budget_of(None).left() is None
-    assert budget_of(None).record() == {}
+    assert Budget(None).left() is None
+    assert Budget(None).record() == {}
 
 
-@pytest.mark.parametrize("seconds", [400.0, 40.0, 20.0])
+@pytest.mark.parametrize("seconds", [400.0, 20.0])
 def test_time_is_shared_by_steps_and_their_costs(seconds: float) -> None:
-    budget, left, shares = budget_of(seconds), seconds, []
+    budget, left, shares = Budget(seconds), seconds, []
     for level in range(3):
         shares.append(budget.share(left, level, STEPS, COSTS.__getitem__))
-        left -= shares[-1] or 0.0
+        left -= shares[-1]
     assert shares == pytest.approx([seconds / 4, seconds / 4, seconds / 2])
 
 
 def test_levels_are_left_out_the_finest_first() -> None:
     """A level is left out where it, or one before it, would get less than its fewest steps."""
-    budget = budget_of(1.0)
-    shares = [budget.share(0.1 * each, 0, STEPS, COSTS.__getitem__) for each in range(200)]
-    assert all(share is not None for share in shares)
-    assert budget.share(4.7, 0, STEPS, COSTS.__getitem__) == 2.35  # 59 steps in all three are not worth it
-    assert budget.share(4.9, 0, STEPS, COSTS.__getitem__) == pytest.approx(4.9 / 4)
-    assert budget.share(0.0, 0, STEPS, COSTS.__getitem__) == 0.0  # without level 0 there is nothing
-    assert budget.share(1.0, 1, STEPS, COSTS.__getitem__) is None
-    assert budget.share(1.0, 1, STEPS, COSTS.__getitem__, begun=True) == 1.0
-    assert budget.share(1.3, 1, STEPS, COSTS.__getitem__) == pytest.approx(1.3)
-
-
-def test_a_part_of_a_share_may_be_for_other_things_than_steps() -> None:
-    budget = budget_of(1.0)
-    assert budget.share(7.0, 0, STEPS, COSTS.__getitem__, training=2 / 3) == 3.5
-    assert budget.share(7.4, 0, STEPS, COSTS.__getitem__, training=2 / 3) == pytest.approx(7.4 / 4)
-
-
-def test_levels_that_are_left_out_are_recorded() -> None:
-    budget = budget_of(3.0)
-    budget.leave_out(1, 3)
-    record = json.loads(json.dumps(budget.record()))["budget"]
-    assert record["left_out"] == [1, 2]
-    assert record["notes"] == [f"levels 1 to 2 are left out: too little time for {BUDGET.fewest_steps} steps"]
-
-
-def making(now: list[float], seconds: Callable[[int], float]) -> tuple[Callable[[int], None], list[int]]:
-    made = []
-
-    def make(count: int) -> None:
-        made.append(count)
-        now[0] += seconds(count)
-
-    return make, made
+    share = partial(Budget(1.0).share, steps=STEPS, cost=COSTS.__getitem__)
+    assert all(share(0.1 * each, 0) is not None for each in range(200))
+    assert share(4.7, 0) == 2.35  # 59 steps in all three are not worth it
+    assert share(4.9, 0) == pytest.approx(4.9 / 4)
+    assert share(0.0, 0) == 0.0  # without level 0 there is nothing
+    assert share(1.0, 1) is None
+    assert share(1.0, 1, begun=True) == 1.0
+    assert share(1.3, 1) == pytest.approx(1.3)
+    # A part of a share may be for other things than steps.
+    assert share(7.0, 0, training=2 / 3) == 3.5
+    assert share(7.4, 0, training=2 / 3) == pytest.approx(7.4 / 4)
 
 
 def test_samples_are_as_many_as_can_be_made(now: list[float]) -> None:
     """Of a second for whatever number, and a millisecond for each."""
-    make, made = making(now, lambda count: 1.0 + 1e-3 * count)
+    made: list[int] = []
+
+    def make(count: int) -> None:
+        made.append(count)
+        now[0] += 1.0 + 1e-3 * count
+
     assert affordable(make, 10**6, 51.0, fewest=1000) == pytest.approx(50_000, rel=1e-3)
     assert affordable(make, 20_000, 51.0, fewest=1000) == 20_000
     assert affordable(make, 10**6, 1.2, fewest=1000) == 1000

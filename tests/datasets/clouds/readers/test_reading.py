@@ -1,35 +1,35 @@
 """``read_cloud``: every format gives back what was written, and bad files give one line."""
 
-import re
 import struct
 
 import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets import PointCloud, read_cloud, write_cloud_ply
+from mplicits.datasets.clouds.point_cloud import unit_rows
 from mplicits.datasets.clouds.readers.reading import open_stream
 from mplicits.neural_fields import InputError
+from refusals import refused
 
 COUNT = 12
+ASCII = b"ply\nformat ascii 1.0\n"
+XYZ = b"property float x\nproperty float y\nproperty float z\n"
+PLY_KINDS = [{"file_type": "ply", "encoding": encoding} for encoding in ("ascii", "binary")]
 
 
 @pytest.fixture
 def cloud():
     random = np.random.default_rng(3)
-    normals = random.normal(size=(COUNT, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit_rows(random.normal(size=(COUNT, 3)))
     points = random.normal(size=(COUNT, 3)) + np.array((431234.5678, 5412345.6789, 250.0))
     return PointCloud(points, normals, random.integers(0, 256, (COUNT, 3)) / np.float32(255), "made up")
 
 
 def same(read, expected, *, points=0.0, normals=1e-7, colors=1e-6):
-    assert np.abs(read.points - expected.points).max() <= points
-    assert (read.normals is None) == (expected.normals is None)
-    assert (read.colors is None) == (expected.colors is None)
-    if expected.normals is not None:
-        assert np.abs(read.normals - expected.normals).max() <= normals
-    if expected.colors is not None:
-        assert np.abs(read.colors - expected.colors).max() <= colors
+    for name, bound in (("points", points), ("normals", normals), ("colors", colors)):
+        found, wanted = getattr(read, name), getattr(expected, name)
+        assert (found is None) == (wanted is None)
+        assert found is None or np.abs(found - wanted).max() <= bound
 
 
 def octasphere():
@@ -79,21 +79,18 @@ def test_ply_with_lists_and_elements_around_the_vertices(tmp_path, cloud, encodi
 def test_polygons_are_fans_of_triangles(tmp_path):
     """A unit square and a triangle above it: the quad counts with its whole area."""
     corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), *((i, 5, 0) for i in range(8))]
-    text = "ply\nformat ascii 1.0\nelement vertex 12\nproperty float x\nproperty float y\nproperty float z\n"
-    text += "element face 2\nproperty list uchar int vertex_index\nend_header\n"
-    text += "\n".join(" ".join(map(str, c)) for c in corners) + "\n4 0 1 2 3\n3 4 5 0\n"
-    path = tmp_path / "quad.ply"
-    path.write_text(text)
-    normals = read_cloud(path).normals
+    head = ASCII + b"element vertex 12\n" + XYZ + b"element face 2\nproperty list uchar int vertex_index\nend_header\n"
+    rows = "\n".join(" ".join(map(str, c)) for c in corners) + "\n4 0 1 2 3\n3 4 5 0\n"
+    (tmp_path / "quad.ply").write_bytes(head + rows.encode())
+    normals = read_cloud(tmp_path / "quad.ply").normals
     assert np.allclose(normals[1:4], (0, 0, 1))
     assert np.allclose(normals[6:], 0)
 
 
 def ball(path):
-    """Read a file of the ball; its normals point outward."""
+    """The cloud of a file of the ball, whose normals point outward."""
     read = read_cloud(path)
-    places = np.unique(read.points.round(5), axis=0)
-    assert len(places) == len(read) == len(octasphere()[0])
+    assert len(np.unique(read.points.round(5), axis=0)) == len(read) == len(octasphere()[0])
     assert (read.normals * read.points).sum(axis=1).min() > 0.98
     return read
 
@@ -112,13 +109,11 @@ def test_stl_text_of_one_or_more_solids(tmp_path, cuts):
     assert ball(tmp_path / "a.stl").normals_source == "mesh"
 
 
-@pytest.mark.parametrize(
-    ("suffix", "options"), [("stl", {}), ("ply", {"encoding": "ascii"}), ("ply", {"encoding": "binary"})]
-)
-def test_meshes_without_normals_become_oriented_clouds(tmp_path, suffix, options):
-    mesh = trimesh.Trimesh(*octasphere(), process=False)
-    (tmp_path / f"a.{suffix}").write_bytes(mesh.export(file_type=suffix, **options))
-    assert ball(tmp_path / f"a.{suffix}").normals_source == "mesh"
+@pytest.mark.parametrize("kind", [{"file_type": "stl"}, *PLY_KINDS], ids=["stl", "ply, ascii", "ply, binary"])
+def test_meshes_without_normals_become_oriented_clouds(tmp_path, kind):
+    path = tmp_path / f"a.{kind['file_type']}"
+    path.write_bytes(trimesh.Trimesh(*octasphere(), process=False).export(**kind))
+    assert ball(path).normals_source == "mesh"
 
 
 def off(head, rows, faces=()):
@@ -141,13 +136,10 @@ def test_off_with_normals_colors_and_faces(tmp_path):
 
 
 def test_ply_triangle_strips(tmp_path):
-    """Rings joined by strips, every second triangle of which is turned round."""
     theta, phi = np.meshgrid(np.linspace(0.1, 3.04, 13), 2 * np.pi * np.arange(24) / 24, indexing="ij")
     vertices = np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1).reshape(-1, 3)
-    items = []
-    for ring in range(12):
-        around = 24 * ring + np.arange(25) % 24
-        items += [*np.stack((around, around + 24), axis=1).ravel(), -1]
+    rings = [24 * ring + np.arange(25) % 24 for ring in range(12)]
+    items = [item for around in rings for item in (*np.stack((around, around + 24), axis=1).ravel(), -1)]
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n".encode() + XYZ
     head += b"element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
     body = vertices.astype("<f4").tobytes() + np.array([len(items), *items], "<i4").tobytes()
@@ -178,10 +170,7 @@ def test_obj_normals_seams_and_colors(tmp_path, cloud):
     read = read_cloud(path)
     assert np.array_equal(read.points, cloud.points)
     assert np.abs(read.colors - cloud.colors).max() < 1e-6
-    assert read.normals[0].tolist() == [1, 0, 1]
-    assert read.normals[1].tolist() == [0, 0, 1]
-    assert read.normals[4].tolist() == [1, 0, 0]
-    assert read.normals[7].tolist() == [0, 0, 0]
+    assert read.normals[[0, 1, 4, 7]].tolist() == [[1, 0, 1], [0, 0, 1], [1, 0, 0], [0, 0, 0]]
 
 
 def write_las(path, points, *, form=0, version="1.2", scale=0.01, **fields):
@@ -246,12 +235,12 @@ def test_laz_that_the_decompressor_cannot_take(tmp_path):
 @pytest.mark.parametrize(
     ("at", "form", "value", "said"),
     [
-        (94, "<H", 60_000, "byte 94: a header of 60000 bytes"),
-        (96, "<I", 2**31, "byte 94: a header of 375 bytes before points at 2147483648"),
-        (100, "<I", 2**30, "byte 100: 1073741824 records in 0 bytes"),
+        (94, "<H", 60_000, "byte 94: .*60000"),
+        (96, "<I", 2**31, "byte 94: .*2147483648"),
+        (100, "<I", 2**30, "byte 100: 1073741824 records"),
         (105, "<H", 3, "byte 105: points of 3 bytes"),
-        (235, "<Q", 2**60, "byte 243: 1 records after the points, from byte 1152921504606846976"),
-        (247, "<Q", 2**40, "1099511627776 points in 1200 bytes"),
+        (235, "<Q", 2**60, "byte 243: .*1152921504606846976"),
+        (247, "<Q", 2**40, "1099511627776 points"),
     ],
 )
 def test_las_headers_that_claim_more_than_the_file_holds(tmp_path, at, form, value, said):
@@ -262,7 +251,7 @@ def test_las_headers_that_claim_more_than_the_file_holds(tmp_path, at, form, val
     struct.pack_into(form, data, at, value)
     path.write_bytes(data)
     for read in (read_cloud, open_stream):
-        with pytest.raises(InputError, match=re.escape(said)):
+        with refused(path, said):
             read(path)
 
 
@@ -274,15 +263,12 @@ def test_a_dense_laz_is_no_wrong_claim(tmp_path):
 
 def test_missing_laspy_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "laspy", None)
-    path = tmp_path / "cloud.las"
-    path.write_bytes(b"LASF")
-    with pytest.raises(InputError, match=r"pip install mplicits\[las\]"):
-        read_cloud(path)
+    (tmp_path / "cloud.las").write_bytes(b"LASF")
+    with pytest.raises(InputError, match=r"mplicits\[las\]"):
+        read_cloud(tmp_path / "cloud.las")
 
 
 HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 20\n"
-ASCII = b"ply\nformat ascii 1.0\n"
-XYZ = b"property float x\nproperty float y\nproperty float z\n"
 GRID = "\n".join(f"{i} {i * i} 1" for i in range(20))
 
 
@@ -316,64 +302,46 @@ GRID = "\n".join(f"{i} {i * i} 1" for i in range(20))
         ("a.xyz", b"1 2 3\n4 5 6\n", "points: 2 with finite coordinates; at least 10"),
         ("a.npy", b"not numpy at all", "damaged or not a NumPy file"),
         ("a.npz", b"PK\x03\x04 broken", "damaged or not a NumPy file"),
+        ("a.npy", np.full((20, 3), None), "Python objects"),
+        ("a.npy", np.zeros((20, 5)), r"shape \(20, 5\): 5 columns"),
+        ("a.npz", {"cloud": np.zeros((20, 3))}, "points: no such array"),
+        ("a.npz", {"points": np.zeros((20, 2))}, r"points: shape \(20, 2\)"),
+        ("a.npz", {"points": np.zeros((20, 3)), "normals": np.zeros((19, 3))}, r"normals: shape \(19, 3\)"),
+        ("a.npz", {"points": np.full((20, 3), None)}, "points: holds Python objects"),
+        ("a.npz", {"points": np.full((20, 3), "a")}, "points: type <U1"),
         ("a.las", b"garbage", "not a readable LAS|pip install"),
+        ("a.ply", None, "no such file"),
     ],
 )
 def test_bad_files_give_one_line(tmp_path, name, content, message):
     path = tmp_path / name
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=message) as caught:
+    if isinstance(content, dict):
+        np.savez(path, **content)
+    elif isinstance(content, np.ndarray):
+        np.save(path, content)
+    elif content is not None:
+        path.write_bytes(content)
+    with refused(path, message):
         read_cloud(path)
-    assert "\n" not in str(caught.value)
-    assert str(path) in str(caught.value)
 
 
-def test_missing_files_and_directories(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        read_cloud(tmp_path / "a.ply")
-    with pytest.raises(InputError, match="is a directory"):
-        read_cloud(tmp_path)
+def test_failed_write_leaves_nothing(tmp_path, cloud):
+    (tmp_path / "file").touch()
+    (tmp_path / "taken").mkdir()
+    for path in (tmp_path / "file" / "cloud.ply", tmp_path / "taken"):
+        with refused(path, "cannot be written"):
+            write_cloud_ply(path, cloud)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "taken"]
 
 
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"cloud": np.zeros((20, 3))}, "points: no such array"),
-        ({"points": np.zeros((20, 2))}, r"points: shape \(20, 2\)"),
-        ({"points": np.zeros((20, 3)), "normals": np.zeros((19, 3))}, r"normals: shape \(19, 3\); expected \(20, 3\)"),
-        ({"points": np.full((20, 3), None)}, "points: holds Python objects"),
-        ({"points": np.full((20, 3), "a")}, "points: type <U1; expected numbers"),
+        ((np.zeros(3),), r"points has shape \(3,\)"),
+        ((np.zeros((4, 3)), np.zeros((3, 3))), "normals has shape"),
+        ((np.zeros((4, 3)), None, np.full((4, 3), 2.0)), "colors: expected"),
     ],
 )
-def test_bad_npz(tmp_path, arrays, message):
-    np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(InputError, match=message):
-        read_cloud(tmp_path / "a.npz")
-
-
-def test_bad_npy(tmp_path):
-    np.save(tmp_path / "a.npy", np.full((20, 3), None), allow_pickle=True)
-    with pytest.raises(InputError, match="Python objects"):
-        read_cloud(tmp_path / "a.npy")
-    np.save(tmp_path / "b.npy", np.zeros((20, 5)))
-    with pytest.raises(InputError, match=r"shape \(20, 5\): 5 columns"):
-        read_cloud(tmp_path / "b.npy")
-
-
-def test_failed_write_leaves_nothing(tmp_path, cloud):
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="cannot be written"):
-        write_cloud_ply(tmp_path / "file" / "cloud.ply", cloud)
-    (tmp_path / "taken").mkdir()
-    with pytest.raises(InputError, match="cannot be written"):
-        write_cloud_ply(tmp_path / "taken", cloud)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "taken"]
-
-
-def test_point_cloud_checks_its_shapes():
-    with pytest.raises(ValueError, match=r"points has shape \(3,\)"):
-        PointCloud(np.zeros(3))
-    with pytest.raises(ValueError, match="normals has shape"):
-        PointCloud(np.zeros((4, 3)), np.zeros((3, 3)))
-    with pytest.raises(ValueError, match="colors: expected"):
-        PointCloud(np.zeros((4, 3)), None, np.full((4, 3), 2.0))
+def test_point_cloud_checks_its_shapes(arrays, message):
+    with pytest.raises(ValueError, match=message):
+        PointCloud(*arrays)

@@ -1,5 +1,3 @@
-"""COLMAP's progress, as its database tells it."""
-
 import sqlite3
 from contextlib import closing
 from itertools import combinations
@@ -10,7 +8,7 @@ from mplicits.datasets.views.poses import colmap_process
 
 
 def test_progress_is_read_without_a_lock(tmp_path: Path) -> None:
-    """As long as somebody writes exclusively, nobody else may open the database: COLMAP would find it locked."""
+    """While one process writes exclusively, others may not open the database: COLMAP would find it locked."""
     database = tmp_path / "a b?.db"
     assert colmap_process._rows(database, "keypoints") == 0
     with closing(sqlite3.connect(database, isolation_level=None)) as theirs:

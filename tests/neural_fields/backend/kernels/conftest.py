@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-# Not pytest.importorskip: a folder's conftest that skips ends the run where the folder is named on the command line.
-# `tests/conftest.py` says at the top of the run what is left out.
+# A conftest that skips (`pytest.importorskip`) would end a run of this folder alone.
 if find_spec("triton") is None:
     collect_ignore_glob = ["test_*.py"]
 
@@ -25,10 +24,7 @@ def place(monkeypatch: pytest.MonkeyPatch) -> torch.device:
 
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Any]]:
-    """``watch(module, name, note)`` → a list of what ``note`` returns of the arguments of each call of a function.
-
-    A test sees by it that it tested the kernels. All functions that it watches share the list.
-    """
+    """``watch(module, name, note)`` → a list, one for all functions, of ``note(arguments)`` of each call."""
     notes: list[Any] = []
 
     def begin(module: Any, name: str, note: Callable[..., Any]) -> list[Any]:

@@ -1,5 +1,3 @@
-"""How many programs of a kernel run at a time, from what the compiled kernel takes."""
-
 from types import SimpleNamespace
 
 import pytest
@@ -21,7 +19,5 @@ ADA = SimpleNamespace(shared_memory_per_multiprocessor=100 << 10, max_threads_pe
         (255, 300 << 10, 8, HOPPER, 1),  # more than there is: the launch itself will say so
     ],
 )
-def test_programs_of_a_multiprocessor(
-    registers: int, shared: int, warps: int, device: SimpleNamespace, expected: int
-) -> None:
+def test_programs_of_a_multiprocessor(registers, shared, warps, device, expected) -> None:
     assert resident_programs(registers, shared, warps, device) == expected

@@ -1,7 +1,9 @@
 """A picture in a dozen launches: the same pixels, depths and normals as by PyTorch."""
 
+import os
 from collections.abc import Callable
 from typing import Any
+from unittest import mock
 
 import mplicits.neural_fields.tracing.picture as fused
 import pytest
@@ -30,12 +32,10 @@ def camera(width: int = 24, height: int = 18, **options: Any) -> Camera:
     return look_at((1.6, 0.9, 2.0), (0.0, 0.0, 0.0), fov=40.0, width=width, height=height, **options)
 
 
-def both(field: Field, view: Camera, monkeypatch: pytest.MonkeyPatch, **options: Any) -> tuple[Seen, Seen]:
-    """What is seen by the kernels, and by PyTorch."""
+def both(field: Field, view: Camera, **options: Any) -> tuple[Seen, Seen]:
     place = next(field.parameters()).device
     ours = trace_view(field, view, device=place, **options)
-    with monkeypatch.context() as patch:
-        patch.setenv("MPLICITS_KERNELS", "off")
+    with mock.patch.dict(os.environ, MPLICITS_KERNELS="off"):
         return ours, trace_view(field, view, device=place, **options)
 
 
@@ -55,45 +55,43 @@ def assert_same(ours: Seen, theirs: Seen, view: Camera) -> None:
 
 
 @pytest.mark.parametrize("taper", [0.0, pytest.param(0.5, marks=pytest.mark.slow)])
-def test_pictures_are_pytorchs(
-    taper: float, place: torch.device, counted: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_are_pytorchs(taper: float, place: torch.device, counted: list[tuple[int, int]]) -> None:
     field, view = waves(place, taper), camera()
-    ours, theirs = both(field, view, monkeypatch)
+    ours, theirs = both(field, view)
     assert len(theirs.pixel) > 50
     assert_same(ours, theirs, view)
-    coarse, expected = both(field, view, monkeypatch, level=0)
+    coarse, expected = both(field, view, level=0)
     assert_same(coarse, expected, view)
     assert counted == [(24, 18)] * 2
     # Normals of the finest level on the surface of the coarsest, which takes no Newton step.
-    mapped, expected = both(field, view, monkeypatch, level=0, normal_level=2)
+    mapped, expected = both(field, view, level=0, normal_level=2)
     assert_same(mapped, expected, view)
     assert float((mapped.normal - coarse.normal).norm(dim=-1).max()) > 1e-2
 
 
-def test_other_views(place: torch.device, counted: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_views(place: torch.device, counted: list[tuple[int, int]]) -> None:
     """A strip of an image, an eye inside the shape, and one that looks away from it."""
     field = waves(place).base
     strip = camera(20, 40).strip(13, 11)
-    assert_same(*both(field, strip, monkeypatch), strip)
+    assert_same(*both(field, strip), strip)
     inside = look_at((0.1, 0.0, 0.0), (1.0, 0.3, 0.0), fov=60.0, width=9, height=7)
-    ours, theirs = both(field, inside, monkeypatch)
+    ours, theirs = both(field, inside)
     assert len(ours.pixel) == 63
     assert_same(ours, theirs, inside)
     away = look_at((1.6, 0.9, 2.0), (3.2, 1.8, 4.0), fov=40.0, width=9, height=7)
-    nothing, _ = both(field, away, monkeypatch)
+    nothing, _ = both(field, away)
     assert len(nothing.pixel) == 0
     assert nothing.normal.shape == (0, 3)
     assert counted == [(20, 11), (9, 7), (9, 7)]
 
 
-def test_a_second_picture_reads_the_weights_of_its_time(place: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_picture_reads_the_weights_of_its_time(place: torch.device) -> None:
     """The memory of the first is used again, and what it gave stays as it was."""
     field, view = waves(place).base, camera()
     before = trace_view(field, view, device=place)
     kept = before.depth.clone()
     field.output.bias.sub_(0.1)  # a larger ball
-    ours, theirs = both(field, view, monkeypatch)
+    ours, theirs = both(field, view)
     assert len(fused._pictures[field]) == 1
     assert len(ours.pixel) > len(before.pixel)
     assert_same(ours, theirs, view)

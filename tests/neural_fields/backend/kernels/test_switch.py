@@ -1,5 +1,3 @@
-"""Which path is taken, and what is said of the other."""
-
 import subprocess
 import sys
 
@@ -32,16 +30,13 @@ def test_what_the_kernels_cannot_do(place: torch.device, changes: dict, reason: 
     assert reason in choice.reason
 
 
-def test_switched_off(place: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_modes(place: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     x = torch.zeros(2, 3, device=place)
     assert choose(x, width=128, depth=2) == (True, "")
     monkeypatch.setenv("MPLICITS_KERNELS", "off")
     assert choose(x, width=128, depth=2) == (False, "MPLICITS_KERNELS=off")
-
-
-def test_a_word_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MPLICITS_KERNELS", "fast")
-    with pytest.raises(InputError, match="MPLICITS_KERNELS='fast' in the environment: expected one of auto, off"):
+    with pytest.raises(InputError, match="MPLICITS_KERNELS='fast'"):
         mode()
 
 

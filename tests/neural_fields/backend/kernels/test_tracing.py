@@ -1,7 +1,9 @@
 """Rays through one network, or through levels and their bands, in one launch, against the same rays by PyTorch."""
 
+import os
 from collections.abc import Callable
 from typing import Any
+from unittest import mock
 
 import mplicits.neural_fields.backend.kernels.launch as launch
 import mplicits.neural_fields.backend.kernels.paths as banded
@@ -47,12 +49,10 @@ def rays(count: int, place: torch.device, aim: float = 0.65) -> tuple[Tensor, Te
     return origins.to(place), normalize(aim * (2 * torch.rand(count, 3) - 1) - origins, dim=-1).to(place)
 
 
-def both(field: Any, origins: Tensor, directions: Tensor, monkeypatch: pytest.MonkeyPatch, **options: Any) -> Any:
-    """Hits by one launch, and by PyTorch."""
+def both(field: Any, origins: Tensor, directions: Tensor, **options: Any) -> Any:
     options = {"tolerance": TOLERANCE, "resolution": 1e-3} | options
     ours = sphere_trace(field, origins, directions, **options)
-    with monkeypatch.context() as patch:
-        patch.setenv("MPLICITS_KERNELS", "off")
+    with mock.patch.dict(os.environ, MPLICITS_KERNELS="off"):
         return ours, sphere_trace(field, origins, directions, **options)
 
 
@@ -69,11 +69,19 @@ def assert_same(ours: Hits, theirs: Hits, field: Any, directions: Tensor, tolera
     assert bool((ours.level == theirs.level)[met].all())
 
 
+def test_one_network_too_wide_for_registers(place: torch.device, counted: list[int]) -> None:
+    field, (origins, directions) = ball(place), rays(20, place)
+    with mock.patch.object(fused, "IN_REGISTERS", 8):
+        ours, theirs = both(field, origins, directions, **COARSE)
+    assert counted == [-20]
+    assert_same(ours, theirs, field, directions, COARSE["tolerance"])
+
+
 def test_rays_end_where_pytorchs_do(place: torch.device, counted: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     """More rays than one program has places for, so that those of the first are taken by others."""
     monkeypatch.setattr(launch, "INTERPRETED_PROGRAMS", 1)
     field, (origins, directions) = ball(place), rays(90, place)
-    ours, theirs = both(field, origins, directions, monkeypatch)
+    ours, theirs = both(field, origins, directions)
     assert sum(counted) > 64  # places of a program
     assert 30 < int(theirs.mask.sum()) < 85
     assert_same(ours, theirs, field, directions)
@@ -83,46 +91,41 @@ def test_rays_end_where_pytorchs_do(place: torch.device, counted: list[int], mon
 
 
 @pytest.mark.slow
-def test_rays_from_inside_and_behind(place: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rays_from_inside_and_behind(place: torch.device) -> None:
     """From the middle out; and a start behind the surface sends a ray back to its beginning."""
     field = ball(place)
     _, directions = rays(40, place)
-    ours, theirs = both(field, torch.zeros_like(directions), directions, monkeypatch)
+    ours, theirs = both(field, torch.zeros_like(directions), directions)
     assert bool(ours.mask.all())
     assert_same(ours, theirs, field, directions)
     origins, directions = rays(40, place)
-    ours, theirs = both(field, origins, directions, monkeypatch, near=1.3)
+    ours, theirs = both(field, origins, directions, near=1.3)
     assert_same(ours, theirs, field, directions)
     assert float(ours.depth[ours.mask].min()) < 1.3
 
 
 @pytest.mark.parametrize("count", [0, 1, 20])
-def test_any_number_of_rays_and_levels_in_range(
-    count: int, place: torch.device, counted: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The coarse level of several; the finer ones are marched as ever."""
+def test_any_number_of_rays_and_levels_in_range(count: int, place: torch.device, counted: list[int]) -> None:
     field = MultiscaleSDF(ball(place), [Siren(8, 1).to(place).requires_grad_(False)], [0.02]).to(place)
     origins, directions = rays(count, place)
-    ours, theirs = both(field, origins, directions, monkeypatch, level=0, max_steps=20)
+    ours, theirs = both(field, origins, directions, level=0, max_steps=20)
     assert ours.depth.shape == theirs.depth.shape == (count,)
     assert counted == [count] * (count > 0)
     if count > 1:
         assert_same(ours, theirs, field.base, directions)
-    ours, theirs = both(field, origins, directions, monkeypatch, max_steps=4, **COARSE)
+    ours, theirs = both(field, origins, directions, max_steps=4, **COARSE)
     assert counted == [count, -count] * (count > 0)
     assert ours.depth.shape == (count,)
     assert float((ours.depth - theirs.depth).abs().sum()) <= 1e-4 * count
 
 
 @pytest.mark.parametrize("taper", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
-def test_rays_through_bands_end_where_pytorchs_do(
-    taper: float, place: torch.device, counted: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rays_through_bands_end_where_pytorchs_do(taper: float, place: torch.device, counted: list[int]) -> None:
     """Some begin inside, and look for the way out; some are told to begin behind the surface, and go back."""
     field, (origins, directions) = waves(place, taper), rays(20, place, aim=0.3)
     origins[:4] *= 0.1
     near = torch.where(torch.arange(20, device=place) < 16, 0.0, 1.2)
-    ours, theirs = both(field, origins, directions, monkeypatch, near=near, max_steps=16, **COARSE)
+    ours, theirs = both(field, origins, directions, near=near, max_steps=16, **COARSE)
     assert counted == [-20]
     assert int((ours.level == 2).sum()) > 15
     assert float(ours.depth[16:].min()) < 1.2
@@ -132,24 +135,12 @@ def test_rays_through_bands_end_where_pytorchs_do(
     assert float((ours.depth - coarse.depth).abs()[met].max()) > 3 * COARSE["tolerance"]
 
 
-def test_more_rays_than_a_tile_go_round_their_rings(
-    place: torch.device, counted: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One program, whose rings are longer than a tile and no multiple of it; nobody gets far in three steps."""
+def test_more_rays_than_a_tile_go_round_their_rings(place, counted, monkeypatch) -> None:
+    """One program, whose rings are longer than a tile and no multiple of it; three steps take no ray far."""
     monkeypatch.setattr(launch, "INTERPRETED_PROGRAMS", 1)
     field, (origins, directions) = waves(place), rays(90, place)
-    ours, theirs = both(field, origins, directions, monkeypatch, max_steps=3, **COARSE)
+    ours, theirs = both(field, origins, directions, max_steps=3, **COARSE)
     assert counted == [-90]
-    assert bool((ours.steps == theirs.steps).all())
-    assert bool((ours.mask == theirs.mask).all())
+    assert torch.equal(ours.steps, theirs.steps)
+    assert torch.equal(ours.mask, theirs.mask)
     assert float((ours.depth - theirs.depth).abs().max()) <= 1e-4
-
-
-def test_one_network_too_wide_for_registers(
-    place: torch.device, counted: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fused, "IN_REGISTERS", 8)
-    field, (origins, directions) = ball(place), rays(20, place)
-    ours, theirs = both(field, origins, directions, monkeypatch, **COARSE)
-    assert counted == [-20]
-    assert_same(ours, theirs, field, directions, COARSE["tolerance"])

@@ -32,22 +32,22 @@ def gradients_again(network: Siren, x: Tensor) -> Sequence[Tensor]:
 
 @pytest.fixture
 def counted(watch: Callable[..., list[int]]) -> list[int]:
-    """How many points came to the kernel each time."""
     return watch(fused, "jet_backward", lambda x, *_: len(x))
 
 
+SIZES = [(16, 1, 65), (24, 2, 1), (24, 2, 200), (40, 3, 33), (128, 2, 33), (144, 2, 1)]
+LARGE = [(256, 2, 65), (400, 2, 65), (400, 3, 65), (64, 5, 65)]
+
+
 @pytest.mark.parametrize(
-    ("width", "depth", "count"), [(16, 1, 65), (24, 2, 1), (24, 2, 200), (40, 3, 33), (128, 2, 33), (144, 2, 1)]
+    ("width", "depth", "count"), [*SIZES, *(pytest.param(*size, marks=pytest.mark.slow) for size in LARGE)]
 )
-def test_gradients_are_those_of_float64(
-    width: int, depth: int, count: int, place: torch.device, counted: list[int]
-) -> None:
+def test_gradients_are_those_of_float64(width, depth, count, place, counted) -> None:
     """Within what rounding may do: relative changes of weights and points by the γ of an inner product."""
     network, x = Siren(width, depth, omega=10.0).to(place), (2 * torch.rand(count, 3) - 1).to(place)
     found = gradients(network, x)
     assert counted == [count]
-    exact = Siren(width, depth, omega=10.0)
-    exact.load_state_dict(network.state_dict())
+    exact = copy.deepcopy(network).cpu()
     bounds = rounding(exact, x.cpu(), gradients_again)
     for one, other, bound in zip(found, gradients_again(exact.double(), x.double().cpu()), bounds, strict=True):
         # A sum over points rounds once more for each of them.
@@ -55,27 +55,18 @@ def test_gradients_are_those_of_float64(
         assert_within(one.cpu(), other, terms * torch.maximum(bound, bound.median()))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("width", "depth"), [(256, 2), (400, 2), (400, 3), (64, 5)])
-def test_gradients_of_large_networks(width: int, depth: int, place: torch.device, counted: list[int]) -> None:
-    test_gradients_are_those_of_float64(width, depth, 65, place, counted)
-
-
 def test_gradients_are_those_of_differences(place: torch.device, counted: list[int]) -> None:
     """Central differences of the loss in float64, along one direction in all weights and points at once."""
     network, x = Siren(24, 2, omega=5.0).to(place), (2 * torch.rand(40, 3) - 1).to(place)
     found = [one.double().cpu() for one in gradients(network, x)]
     ways = [torch.randn_like(one) for one in found]
-    exact = Siren(24, 2, omega=5.0).double()
 
+    @torch.no_grad()
     def moved(step: float) -> float:
-        state = {name: part.double().cpu() for name, part in network.state_dict().items()}
-        names = [name for name, _ in exact.named_parameters()]
-        for name, way in zip(names, ways[1:], strict=True):
-            state[name] = state[name] + step * way
-        exact.load_state_dict(state)
-        with torch.no_grad():
-            return float(loss(exact, x.double().cpu() + step * ways[0]))
+        exact = copy.deepcopy(network).cpu().double()
+        for parameter, way in zip(exact.parameters(), ways[1:], strict=True):
+            parameter.add_(step * way)
+        return float(loss(exact, x.double().cpu() + step * ways[0]))
 
     step = 1e-5  # its square, and rounding over it, are far below float32
     expected = (moved(step) - moved(-step)) / (2 * step)
@@ -109,8 +100,6 @@ def test_twice(place: torch.device) -> None:
         (second,) = torch.autograd.grad(gradient[:, 0].sum(), points, create_graph=True)
         return list(torch.autograd.grad(second.square().sum(), list(field.parameters())[:-1]))
 
-    exact = Siren(16, 2, omega=5.0).double()
-    exact.load_state_dict(network.state_dict())
-    expected = bend(exact, x.detach().double().cpu().requires_grad_())
+    expected = bend(copy.deepcopy(network).cpu().double(), x.detach().double().cpu().requires_grad_())
     for one, other in zip(bend(network, x), expected, strict=True):
         assert_within(one.cpu(), other, 1e-5 * other.abs().max())
