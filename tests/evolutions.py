@@ -1,6 +1,8 @@
-"""What the tests of evolutions share: small settings, a fit that takes no time, bad input."""
+"""What the tests of evolutions share: small settings, a fit that takes no time, interruptions, bad input."""
 
 import dataclasses
+import os
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +15,7 @@ from mplicits.pipelines.evolve import checks as evolve_checks
 from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.training.settings import EvolveConfig
+from mplicits.pipelines.training.trainer import Progress
 
 BRIEF = EvolveConfig(
     kind="transport",
@@ -56,6 +59,18 @@ def ball(path: Path, radius: float, *, levels: bool = False) -> None:
         adam.step()
     field = MultiscaleSDF(siren, [], []) if levels else siren
     save_field(path, field, similarity=Similarity((5.0, 0.0, 0.0), 2.0))
+
+
+def interrupt(stage: str, step: int) -> Callable[[Progress], None]:
+    """A progress display that presses Ctrl-C, once, from a step of a stage on."""
+    done = []
+
+    def report(progress: Progress) -> None:
+        if progress.stage == stage and progress.step >= step and not done:
+            done.append(step)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    return report
 
 
 def fails(

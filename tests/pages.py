@@ -1,6 +1,8 @@
 """What tests of pages share: a small field with colours, pictures that a page traces, what they are held against."""
 
 import base64
+import json
+import re
 import time
 from typing import NamedTuple
 
@@ -82,3 +84,26 @@ def differences(found, field, camera, level, *, tolerance, resolution) -> Differ
         np.abs(found[..., 3] - hits.depth.numpy())[both],
         np.degrees(2 * np.arcsin(chord.clip(0, 2) / 2)),
     )
+
+
+def open_page(browser, address, flags="", *, kind="WebGL 2"):
+    """Open a page with rays of 16 pixels at rest, as software is slow; `kind` is what it must trace with."""
+    parameters = "&".join(["pixel=16", *([flags] if flags else []), *(["webgl"] if kind == "WebGL 2" else [])])
+    browser.get_log("browser")  # messages of pages before this one
+    browser.get(f"{address}{'&' if '?' in address else '?'}{parameters}")
+    until(lambda: browser.execute_script("return window.mplicits?.renderer?.kind"))
+    assert browser.execute_script("return window.mplicits.renderer.kind") == kind
+
+
+def written_header(page):
+    """What a page holds about its field or shapes."""
+    return json.loads(re.search(r'id="header">(.*?)</script>', page.read_text(encoding="utf-8"))[1])
+
+
+def round_field(radius, *, levels=1):
+    """A SIREN that is nearly a ball, and residuals in a wide band, which cannot be trained."""
+    torch.manual_seed(0)
+    base = Siren(16, 1, omega=4.0)
+    solve_sphere(base, radius)
+    residuals = [Siren(8, 1, omega=5.0, output_gain=0.05) for _ in range(levels - 1)]
+    return MultiscaleSDF(base, residuals, [0.2] * (levels - 1)).requires_grad_(False)

@@ -15,7 +15,9 @@ from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct import train as reconstruct_texture
+from mplicits.pipelines.reconstruct.objective import SceneObjective
 from mplicits.pipelines.training.settings import ReconstructConfig, TextureConfig
+from mplicits.pipelines.training.trainer import Trainer
 from torch import Tensor, nn
 
 # Two levels that take no time, for a few steps on a few rays.
@@ -76,3 +78,8 @@ def exact_model(inv_std: float = 2000.0, exposures: scene_model.Exposures | None
     with torch.no_grad():
         model.variance.fill_(math.log(inv_std) / 10)
     return model
+
+
+def weights(trainer: Trainer[SceneObjective]) -> dict[str, Tensor]:
+    """A copy of all weights of a scene in training."""
+    return {name: tensor.detach().cpu().clone() for name, tensor in trainer.objective.model.state_dict().items()}

@@ -103,7 +103,7 @@ def measured_flags(parser: argparse.ArgumentParser, resolution: int, samples: in
 
 
 def view_flags(parser: argparse.ArgumentParser, *, views: int) -> None:
-    """Flags for the cameras around a shape, of which there are ``views`` by default, and for its coarse surface."""
+    """Flags for the cameras around a shape (``views`` by default), and for its coarse surface."""
     number(parser, "--views", whole(1), views, "cameras around it")
     number(parser, "--size", whole(16, 4096), 512, "of the images")
     parser.add_argument("--up", choices=("y", "z"), default="y", help="the axis that points up (y)")

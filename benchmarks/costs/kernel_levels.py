@@ -41,7 +41,7 @@ class LevelsRow:
         fused_bytes: of a point, that the kernel reads and writes, lists of rows in bands included.
         staged_bytes: of a point, that the kernel puts aside in caches, and reads again.
         unfused_launches: of a call.
-        unfused_waits: of a call; the kernel is one launch, and nobody waits.
+        unfused_waits: of a call; the kernel is one launch without a wait.
     """
 
     name: str

@@ -24,7 +24,7 @@ from .rounding import rounding_bound
 from .traffic import traffic_of
 
 POINT, JET = 12, 16  # bytes of a point, and of a value with its gradient
-# Bytes are counted of so many times the points, so that those of weights do not count.
+# Factor on the number of points whose bytes are counted, so that those of weights do not count.
 MANY = 64
 SIZES = tuple((width, depth) for width in (16, 64, 128, 256, 400) for depth in (1, 2, 3))
 
@@ -175,7 +175,7 @@ def staged_bytes(width: int, depth: int) -> float:
 
 @contextmanager
 def evaluated_by(mode: str) -> Iterator[None]:
-    """Inside of this the kernels are used as ``mode``, one of `MODES`, says, whatever was asked for."""
+    """Use the kernels in ``mode``, one of `MODES`, inside the context; it overrides the environment."""
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = mode
     try:

@@ -101,7 +101,7 @@ class RenderBench(Benchmark[RenderRow]):
         size: width and height of the images.
         views: how many cameras, evenly around the shape.
         mesh_resolution: cells along each side of the meshes that holes are counted against.
-        repeats: the best of so many is what counts.
+        repeats: runs of each measurement; the best counts.
         naive: whether to time the naive tracer as well (one camera, once: it takes a minute).
         networks: what to fit; the names are those of `NETWORKS`.
     """
@@ -239,7 +239,7 @@ def _best(cameras: Sequence[Camera], draw: Callable[[Camera], Seen]) -> tuple[fl
 
 @torch.inference_mode()
 def naive_view(field: Field, camera: Camera, *, steps: int, device: torch.device | str = "cpu") -> Seen:
-    """Sphere tracing as it is first written: every level everywhere, every ray to the end, all rays in one batch."""
+    """Naive sphere tracing: every level everywhere, every ray to the end, all rays in one batch."""
     eye, directions = camera.rays(device=device)
     flat = directions.reshape(-1, 3)
     depth = torch.full_like(flat[:, 0], max(float(eye.norm()) - BOUNDING_RADIUS, 0.0))

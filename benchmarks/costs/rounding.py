@@ -1,18 +1,19 @@
 """How far a value and a gradient computed in float32 may be from the exact ones, whatever the order of their sums.
 
-A running error analysis, layer by layer, in float64: an inner product of n terms is off by at most γ_n Σ|terms| with
-γ_n = n u / (1 − n u) (Higham 2002, Sec. 3.1), for any order, in pieces or not, with fused multiply-adds or without; a
-sine by 4u, two units in the last place of numbers near 1 (CUDA's libdevice and the polynomial of `tensor_tiles.py`; CPU
-libraries stay below); and what the layer below is off by goes through the absolute values of the weights:
+This is a running error analysis, layer by layer, in float64. An inner product of n terms is off by at most γ_n Σ|terms|
+with γ_n = n u / (1 − n u) (Higham 2002, Sec. 3.1). That holds for any order, in pieces or not, with fused multiply-adds
+or without. A sine is off by 4u, two units in the last place of numbers near 1 (CUDA's libdevice and the polynomial of
+`tensor_tiles.py`; CPU libraries stay below). The error of the layer below goes through the absolute values of the
+weights:
 
     e_i = ω₀(|W_i| e_{i−1} + γ_{n+4}(|W_i||h_{i−1}| + |b_i|)) + 4u
 
 and likewise on the way back. Phases are multiplied by ω₀, or weights before: both are in the γ. So the bound is made of
 rounding, depth and weights. It holds at every point, and is pessimistic, since errors cancel.
 
-Products of float16 halves (`packing.py`) are sums of 3n terms, where each operand is off by 2⁻²² = 4u of itself and as
-much is left out: 12u of each term, and for entries that are tiny beside the largest one u/16 of that. Tensor cores may
-cut sums off in place of rounding them, once for 16 terms or less, which is within the γ of 3n terms.
+Products of float16 halves (`packing.py`) are sums of 3n terms. Each operand is off by 2⁻²² = 4u of itself and as much
+is left out. That is 12u of each term, and for entries that are tiny beside the largest one u/16 of that. Tensor cores
+may cut sums off in place of rounding them, once for 16 terms or less, which is within the γ of 3n terms.
 """
 
 from __future__ import annotations
@@ -140,5 +141,5 @@ def _product_error(size: Tensor, terms: Tensor, weight: Tensor, u: float, halves
 
 
 def _gamma(terms: int, u: float) -> float:
-    """γ of so many terms, and of what is done beside them."""
+    """γ of ``terms`` terms and of the operations beside them."""
     return (terms + FURTHER) * u / (1 - (terms + FURTHER) * u)

@@ -77,15 +77,15 @@ class NormalsRow:
 class NormalsBench(Benchmark[NormalsRow]):
     """Value, jet, the paper's Algorithm 1 and torch.autograd, timed on the same random points and weights.
 
-    Algorithm 1 runs in the same blocks and buffers as the jet, so that they differ in method only: once as the
-    paper prints it, where each of the three asynchronous passes makes its own activations, and once with
+    Algorithm 1 runs in the same blocks and buffers as the jet, so that they differ in method only. It runs once as
+    the paper prints it, where each of the three asynchronous passes makes its own activations. It also runs with
     the activations shared, the best a forward method can do on one processor. Autograd runs as users run
     it, on all points at once.
 
     Attributes:
         points: how many.
         sizes: widths and depths of the networks.
-        repeats: the best of so many is what counts; beside busy processes the median.
+        repeats: runs of each measurement; the best counts, or beside busy processes the median.
         seed: of points and weights.
         busy: processes that multiply matrices meanwhile, as others do on a machine that is shared.
     """
@@ -341,8 +341,8 @@ class MeshBench(Benchmark[MeshRow]):
     """Ours at each of ``resolutions``, and its peers at ``reference``, over the same box.
 
     The paper's scheme evaluates level 0 at every lattice point and finer levels in their bands, then runs dense
-    marching cubes (scikit-image). The dense peer is one (256,4) SIREN with random weights, of which only the
-    evaluation is timed; unless ``full``, on every 32nd slab of the lattice, and extrapolated linearly.
+    marching cubes (scikit-image). The dense peer is one (256,4) SIREN with random weights. Only
+    its evaluation is timed; unless ``full``, on every 32nd slab of the lattice, and extrapolated linearly.
     Every row is made in a fresh process, so that its peak memory is its own.
 
     Attributes:

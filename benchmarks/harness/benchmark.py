@@ -93,7 +93,7 @@ class Benchmark(Method[Part], Generic[R]):
         """The rows of a cell.
 
         Raises:
-            InputError: what is asked for cannot be used.
+            InputError: an option or a file cannot be used.
         """
 
     @abstractmethod
@@ -121,7 +121,7 @@ class Benchmark(Method[Part], Generic[R]):
         return [from_figures(self.row, output) for record in records for output in record["outputs"]]
 
     def rows(self, out: Path, **heard: Any) -> list[R]:
-        """Do all cells, or take what is there, and raise what one of them raises.
+        """The rows of all cells, from results on disk where they exist; raises what a cell raises.
 
         Args:
             out: folder of the results.

@@ -167,7 +167,7 @@ class Method(ABC, Generic[C]):
         """Do the work of a cell.
 
         Raises:
-            InputError: what is asked for cannot be read or used.
+            InputError: an option or a file cannot be read or used.
         """
 
 

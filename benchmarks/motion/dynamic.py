@@ -64,7 +64,7 @@ class DynamicBench(Benchmark[DynamicRow]):
     Attributes:
         run_file: a run of ``mplicits evolve``; or
         morph: the bench whose morph is seen.
-        size: pictures have so many pixels squared.
+        size: width and height of the pictures in pixels.
         resolution: of the meshes.
         frames: see `dynamic_rows`.
     """
@@ -127,7 +127,7 @@ def dynamic_rows(
     Args:
         field: four-dimensional.
         frames: of the film, at least 3.
-        size: pictures have so many pixels squared.
+        size: width and height of the pictures in pixels.
         cells: of the meshes, along each side.
         level: whose surface.
 

@@ -1,8 +1,8 @@
-"""``motion A B``: what lies between two meshes that have no truth in between, by what can be seen.
+"""``motion A B``: figures of the motion between two meshes, without a ground truth in between.
 
 Each mesh is fitted, and every kind of ``evolve`` that goes from shape to shape is trained between the fits; the blend
-of their distances stands beside them. Parts, holes, volume and area are taken at moments on the way, a mesh of the
-start is carried to the end, and pictures are looked at pixel by pixel: both ends are painted, each with smooth waves of
+of their distances stands beside them. Parts, holes, volume and area are taken at moments on the way. A mesh of the
+start is carried to the end, and pictures are compared pixel by pixel. Both ends are painted, each with smooth waves of
 its own, and carried colours should be as smooth as those of the ends.
 """
 
@@ -48,7 +48,7 @@ PAIR_FITS = FitConfig(
 )
 PIXELS = 256  # on each side of the pictures whose neighbouring pixels are compared
 VIEWS = 2  # from opposite sides
-APART = 3.0  # neighbours whose points are further apart than so many pixels are on two sides of an outline
+APART = 3.0  # pixels; neighbours whose points are further apart are on two sides of an outline
 JUMP = 1.5  # of the ends' largest, which neighbours should not exceed
 WAVES, CRESTS = 6, 5.0  # of the paint in each channel, and their wave numbers' deviation along each axis
 TILE, ACROSS = 200, 7  # pixels of a picture on a contact sheet, and pictures in a row

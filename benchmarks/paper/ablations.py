@@ -125,7 +125,7 @@ class DeltaFactor(Method[PaperCell]):
 
 
 def short(config: FitConfig, preset: Preset) -> FitConfig:
-    """The schedule of one ablated level: on a CPU shorter than the fit's own, since there are so many of them."""
+    """The schedule of one ablated level: on a CPU shorter than the fit's own, since there are many levels."""
     if preset != "cpu":
         return config
     steps = tuple(min(count, SHORT_STEPS) for count in config.steps)
@@ -271,7 +271,7 @@ def _notes(found: Sequence[Record]) -> tuple[str, ...]:
     return (
         f"Means over the shapes ({', '.join(shapes)}); the paper's figures are of Lucy.",
         f"The error is taken over {POINTS[preset]:,} points, uniform on the mesh and moved along its normal by up to "
-        f"±{REACH:g}, against exact signed distances to the mesh; the paper does not say where it measures.",
+        f"±{REACH:g}, against exact signed distances to the mesh. The paper does not define its points.",
         "Coarser levels come from one finished fit of the shape; only the level in question is trained again"
         + (f", for {SHORT_STEPS} steps of {SHORT_BATCH:,} samples." if preset == "cpu" else "."),
         f"Weights and factors tried here: {', '.join(f'{w:g}' for w in WEIGHTS[preset])} and "

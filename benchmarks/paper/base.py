@@ -65,7 +65,7 @@ def base_cell(cell: PaperCell, overrides: tuple[tuple[str, Any], ...] = ()) -> P
 
 
 def base_of(cell: PaperCell, work: Workplace, overrides: tuple[tuple[str, Any], ...] = ()) -> Base:
-    """Load that fit; train it first if nobody has.
+    """Load that fit; train it first if there is none.
 
     Raises:
         InputError: the cloud cannot be read or used.

@@ -53,7 +53,7 @@ TITLE = "The paper's tables, measured here"
 
 @dataclass(frozen=True)
 class Bench:
-    """What is asked for.
+    """The options of a bench.
 
     Attributes:
         shapes: see `find_shapes`.
@@ -79,17 +79,17 @@ class Bench:
 
 
 def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple[list[Section], int]:
-    """Run a bench and write what it found into a folder; what is there already is used.
+    """Run a bench and write the results into a folder; results that exist there are used.
 
     The page holds the tables of earlier runs into the same folder too, if shapes, preset and seed are the same.
 
     Args:
-        bench: what is asked for.
+        bench: the options.
         out: the folder.
         say: told one line per cell.
 
     Returns:
-        The sections that were asked for, and how many cells failed.
+        The sections of the chosen tables, and how many cells failed.
 
     Raises:
         InputError: the folder cannot be written, or see `run_cells`.
@@ -218,7 +218,7 @@ def find_shapes(paths: Sequence[str | Path], *, reference: Path | None = None) -
     """The shapes that files and folders name.
 
     Args:
-        paths: mesh files, folders (of which every mesh counts), or clouds if there is a reference.
+        paths: mesh files, folders (every mesh in them), or clouds if there is a reference.
         reference: the mesh that those without faces are measured against.
 
     Raises:

@@ -19,7 +19,7 @@ from ..peers import BandLimited, BanfSDF, HashGridSDF
 from .cells import Preset
 from .recipe import Output, Recipe, SignedPools, cosine, descend, differences, finished, mape_loss, stencil
 
-# Rows per call where a field is asked about a whole pool.
+# Rows per call where a field is evaluated on a whole pool.
 CHUNK = 1 << 16
 
 
@@ -176,7 +176,7 @@ BANF_PRESETS: Mapping[Preset, BanfSettings] = {
 }
 # Share of the first level's steps in which its rate rises to the full one.
 WARM_UP = 0.1
-# Of a batch, one point in so many is also asked for derivatives, each of which takes seven values.
+# One in `SPARSE` points of a batch also gets derivatives, at seven values a point.
 SPARSE = 8
 
 
@@ -250,7 +250,7 @@ def _train_level(
     def loss(_: int) -> Tensor:
         rows = torch.randint(len(points), (settings.batch,), generator=generator).to(points.device)
         few = torch.randint(len(crosses), (settings.batch // SPARSE,), generator=generator).to(points.device)
-        # In one call, so that a vertex that both need is asked once.
+        # In one call, so that a vertex that both need is evaluated once.
         value = part.value(torch.cat((points[rows], crosses[few].reshape(-1, 3))))
         gradient, laplacian = differences(value[len(rows) :].reshape(-1, 7) + at_crosses[few], step)
         data = data_loss(value[: len(rows)], left[rows]).mean()

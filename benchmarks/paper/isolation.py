@@ -113,7 +113,7 @@ class IndependentLevels(Field):
 class Isolation(Method[PaperCell]):
     """One variant of the residual levels, trained on the coarse level of our fit; ``overrides``: variant, a, b or c.
 
-    Variant (a) is the fit itself, so its cell only extracts it once more: as it is, and without culling. No blobs are
+    Variant (a) is the fit itself, so its cell only extracts it once more, with and without culling. No blobs are
     removed from any of them, as the fit's own row elsewhere has it, since blobs are what this is about.
     """
 
@@ -263,8 +263,8 @@ def _culling_table(records: Sequence[Record]) -> Table:
             rows.append(Row(name, (mean(output.get("chamfer") for output in outputs), span), published))
     columns = (Column("mean CD, 1 % noise", best="lowest"), Column("components"))
     notes = (
-        "Without culling the finest level is asked everywhere: of (a) the sum of all levels, of (c) its last network. "
-        "Those meshes are extracted at half the resolution, since the whole lattice must be evaluated.",
+        "Without culling the finest level is evaluated everywhere: for (a) the sum of all levels, for (c) its last "
+        "network. Those meshes are extracted at half the resolution, since the whole lattice must be evaluated.",
     )
     return Table("isolation-culling", "What is left outside the bands", "variant", columns, tuple(rows), notes)
 

@@ -25,7 +25,7 @@ from mplicits.pipelines.training.settings import FitConfig, load_config
 from ..harness.cells import Workplace
 from .cells import PaperCell, Preset
 
-# Bound on |∇f| for extracting fields whose slope nobody keeps near 1: what is culled by it is safely empty.
+# Bound on |∇f| for extracting fields whose slope is not trained to 1: blocks that it culls are safely empty.
 STEEP = 2.0
 # Steps on the coarsest level of an output and on each finer one (paper, Sec. 4).
 FIRST_STEPS, MORE_STEPS = 20, 5

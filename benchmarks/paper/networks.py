@@ -86,7 +86,7 @@ class _CloudBatches:
         self.generator = torch.Generator().manual_seed(seed)
 
     def draw(self) -> tuple[Tensor, Tensor]:
-        """Points ``(N, 3)``, of which the first M are on the surface, and the normals ``(M, 3)`` there."""
+        """Points ``(N, 3)``, the first M of them on the surface, and the normals ``(M, 3)`` there."""
         chosen = torch.randint(len(self.points), (self.on,), generator=self.generator)
         off = (2 * torch.rand(self.off, 3, generator=self.generator) - 1) * CUBE
         return torch.cat((self.points[chosen], off)).to(self.device), self.normals[chosen].to(self.device)
@@ -174,7 +174,7 @@ class BaconSettings:
     steps: int
     batch: int
     rates: tuple[float, float]  # first and last
-    pool: int  # samples made once, of which the batches are drawn
+    pool: int  # samples made once; batches are drawn from them
     coarse_weight: float = 0.01
 
 
@@ -366,7 +366,7 @@ def displaced(field: IdfSDF, x: Tensor, base: Tensor, slope: Tensor) -> tuple[Te
 
 
 def hand_over(done: float) -> float:
-    """What is left of the base's weights and rate: 1, from `BASE_ALONE` falling as a cosine to 0 at `BASE_FROZEN`."""
+    """Factor on the base's weights and rate: 1, from `BASE_ALONE` falling as a cosine to 0 at `BASE_FROZEN`."""
     return cosine(1.0, 0.0, min(max((done - BASE_ALONE) / (BASE_FROZEN - BASE_ALONE), 0.0), 1.0))
 
 
@@ -378,7 +378,7 @@ def _rate_of_displacement(done: float) -> float:
 
 
 def begin_as_sphere(network: Siren, steps: int, *, batch: int = 1024) -> None:
-    """Train a SIREN in place to |x| − `SPHERE_RADIUS` on the whole cube; no step leaves it as it is.
+    """Train a SIREN in place to |x| − `SPHERE_RADIUS` on the whole cube; with 0 steps it is not changed.
 
     In the cube's corners too, unlike `fit_sphere`: what is negative there stays so as a blob, since SIREN's loss
     asks nothing of a sign off the surface. torch's random state is used.

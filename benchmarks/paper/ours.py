@@ -60,7 +60,7 @@ class Ours(Method[PaperCell]):
         return {"fit": {k: v for k, v in dataclasses.asdict(our_config(cell)).items() if k not in left_out}}
 
     def run(self, cell: PaperCell, work: Workplace) -> Findings:
-        """Fit, and measure every level; an interrupted fit goes on, and a finished one is taken as it is."""
+        """Fit, and measure every level; an interrupted fit goes on, and a finished one is reused."""
         judge, directory = Judge(cell, work), work.run()
         config = dataclasses.replace(our_config(cell), device=work.device)
         run = kept_fit(directory, damaged_cloud(cell), config, progress=work.progress)

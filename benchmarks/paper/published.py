@@ -1,8 +1,8 @@
 """The figures that the paper prints, by its own labels of the tables.
 
 Rows are named as the outputs are here. Chamfer distances are squared L2, both ways; "IoU" is the overlap of surface
-voxels (`shell_iou`). All were measured on an RTX 5090, on Stanford and Thingi32 shapes; the ablations, of which there
-are the mean errors of the medium and of the fine level, on Lucy.
+voxels (`shell_iou`). All were measured on an RTX 5090, on Stanford and Thingi32 shapes. The ablations were measured
+on Lucy, and have the mean errors of the medium and of the fine level.
 """
 
 from __future__ import annotations

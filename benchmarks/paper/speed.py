@@ -33,7 +33,7 @@ SIZES: Mapping[Preset, Overrides] = MappingProxyType(
     }
 )
 BASELINE = (256, 4)
-# Slabs of the grid that are really evaluated: all, or every so many-th.
+# One slab of the grid in this number is really evaluated; 1 is all.
 EVERY: Mapping[Preset, int] = MappingProxyType({"smoke": 4, "cpu": 32, "paper": 1})
 SIDES: Mapping[Preset, tuple[int, ...]] = MappingProxyType(
     {"smoke": (16, 32), "cpu": (512, 1024), "paper": (512, 1024)}
@@ -77,7 +77,7 @@ def grid_seconds(field: Field, resolution: int, *, every: int = 1) -> float:
     Args:
         field: on the device of its parameters.
         resolution: cells along each side of the mesher's box.
-        every: evaluate only every so many-th plane, and take the others to cost as much.
+        every: evaluate only one plane in ``every``, and take the others to cost as much.
     """
     axis = torch.linspace(-1.02, 1.02, resolution + 1)
     plane = torch.cartesian_prod(axis[:1], axis, axis).to(field.like.device)
@@ -155,9 +155,10 @@ def marching_cubes_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     sampled = "" if every == 1 else f", timed on every {every}th plane of the grid and extrapolated"
     notes = (
         f"{levels} at {resolution}³ against one SIREN {BASELINE}, whose weights are random, on "
-        f"{found[0]['environment']['device']}; the paper's figures are of 512³ on an RTX 5090.",
-        f"The first three columns are seconds for evaluating the whole grid{sampled}: all levels everywhere, or the "
-        "coarse level everywhere and finer ones in their bands. Our extraction culls blocks and includes triangles.",
+        f"{found[0]['environment']['device']}. The paper's figures are of 512³ on an RTX 5090.",
+        f"The first three columns are seconds for evaluating the whole grid{sampled}. They are for all levels "
+        "everywhere, or the coarse level everywhere and finer ones in their bands. Our extraction culls blocks and "
+        "includes triangles.",
     )
     return (Table("marching-cubes", "Marching cubes (tab:time_mc)", "shape", columns, tuple(rows), notes),)
 

@@ -4,9 +4,9 @@ With filters g_i(x) = sin(Ω_i x + φ_i), whose frequencies Ω_i are drawn once 
 
     z_0 = g_0(x),   z_i = g_i(x) ⊙ (W_i z_{i-1} + b_i),   f_i(x) = w_i · z_i + c_i.
 
-A product of sines is a sum of sines of the sums and differences of their frequencies, so that z_i holds no frequency
-above the sum of the filters' own, whatever the weights are; and since all frequencies are whole multiples of
-one, every output is a Fourier series with a known number of terms. The gradient is one sweep back: with
+A product of sines is a sum of sines of the sums and differences of their frequencies. So z_i holds no frequency above
+the sum of the filters' own, whatever the weights are. Since all frequencies are whole multiples of one, every output is
+a Fourier series with a known number of terms. The gradient is one sweep back: with
 a_i = W_i z_{i-1} + b_i and ζ_i the derivative of f by z_i,
 
     ∇f = Σ_i (ζ_i ⊙ a_i ⊙ cos(Ω_i x + φ_i)) Ω_i  (a_0 = 1),   ζ_{i-1} = (ζ_i ⊙ g_i) W_i.

@@ -1,7 +1,7 @@
-"""BANF: band-limited neural fields (Shabanov et al. 2024), a cascade of networks that are only asked at grid vertices.
+"""BANF: band-limited neural fields (Shabanov et al. 2024), a cascade of networks evaluated at grid vertices only.
 
-What a network says at the vertices of a grid, interpolated linearly, holds no frequency that the grid cannot: so each
-level's network is asked there and nowhere else, and level k of the cascade is the sum of the first k + 1 interpolants.
+The values of a network at the vertices of a grid, interpolated linearly, hold no frequency that the grid cannot. So
+each level's network is evaluated only there. Level k of the cascade is the sum of the first k + 1 interpolants.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class BandLimited(OneLevelField):
         return Jet(value.reshape(x.shape[:-1]), gradient.reshape(x.shape), x.new_empty(*x.shape[:-1], 0))
 
     def _corners(self, place: Place) -> Tensor:
-        """The field at the vertices of cells, ``(N, 2, 2, 2, 1)``; a vertex that cells share is asked once."""
+        """The field at the vertices of cells, ``(N, 2, 2, 2, 1)``; a vertex that cells share is evaluated once."""
         i, j, k = vertices(place.cell)
         side = self.resolution + 1
         keys, index = torch.unique((i * side + j) * side + k, return_inverse=True)

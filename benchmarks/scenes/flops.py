@@ -1,13 +1,13 @@
-"""Training of a scene under observation: how long every step takes, and what its networks multiply.
+"""Training of a scene under observation: seconds of every step, and FLOPs of its networks.
 
-Rows are counted while they are asked for: points whose value alone is wanted (to find out where to sample), points
-whose jet is trained, and colours. What one row costs is what torch's counter of FLOPs finds in the same module, in
-matrix products alone (a product of (a, b) and (b, c) is 2 abc FLOPs; sines and the like are not counted):
+Rows are counted while they are evaluated: points with a value alone (to place the samples), points whose jet is
+trained, and colours. The cost of one row comes from torch's counter of FLOPs on the same module, in matrix products
+alone (a product of (a, b) and (b, c) is 2 abc FLOPs; sines and the like are not counted):
 
-- a value: one pass, about 2 FLOPs per weight;
-- a jet that is trained: one pass forward and one sweep back, and for each of these two a product for the cotangent of
-  the weights and one for that of the activations: six passes, about 12 FLOPs per weight;
-- a colour that is trained: forward and its two cotangents, three passes, about 6 FLOPs per weight.
+- A value is one pass, about 2 FLOPs per weight.
+- A jet that is trained is one pass forward and one sweep back. Each of these two has a product for the cotangent of the
+  weights and one for that of the activations. That makes six passes, about 12 FLOPs per weight.
+- A colour that is trained is forward and its two cotangents: three passes, about 6 FLOPs per weight.
 
 "About", because the points themselves are not trained, and because outputs that are features are not swept back.
 """
@@ -48,7 +48,7 @@ class LateRows:
     """Rows of the second half of a training, when the surface is known and rays cost what they will go on to cost.
 
     Attributes:
-        steps: in which they were asked for.
+        steps: in which they were evaluated.
         values: of each level, without gradient.
         jets: of each level, with gradient.
         colors: of the colour network.
@@ -66,7 +66,7 @@ class Watched:
 
     Attributes:
         trainer: with its model.
-        finished: False if it was asked to stop.
+        finished: False if it was stopped.
         step_seconds: median of the steps.
         values: rows of each level without gradient.
         jets: rows of each level with gradient.
@@ -282,7 +282,7 @@ class _Clock:
         vars(owner)[method] = timed  # before the method of its class
 
     def remove(self) -> None:
-        """The method of the class is asked again."""
+        """Restore the method of the class."""
         del vars(self.owner)[self.method]
 
 

@@ -134,7 +134,7 @@ class GeometryBench(Benchmark[GeometryRow]):
         seeds: 0, 1, … below it, two at least.
         geometries: those of `GEOMETRIES` that are trained.
         streams: trainings at a time; a step of each takes longer for that.
-        test_views: at most so many of the held-out views are measured, evenly chosen.
+        test_views: the most held-out views that are measured, evenly chosen.
         resolution: of the marching cubes, of the exact surface as well.
         samples: points on each surface for Chamfer distances.
     """

@@ -50,7 +50,7 @@ ALIKE: Mapping[str, Any] = {"jets": 0, "focus": 0.0}  # or each network would ha
 
 @dataclass(frozen=True, eq=False)
 class BenchScene:
-    """Posed images, and what is known of them.
+    """Posed images, and the exact scene where there is one.
 
     Attributes:
         name: for tables and files.
@@ -84,14 +84,14 @@ class ReconstructBench(Benchmark[ReconstructRow]):
 
     All see the same rays in the same order, with the same numbers of samples and the same threshold below which
     sections are skipped. NeuS has its own colour network,
-    256 features and the position as it is, and one learning rate for everything but the uncertainty, which both
-    sharpen alike. A sheet of all rows per scene is written into the folder of the results.
+    256 features and the position without an encoding. It has one learning rate for everything but the uncertainty,
+    which both sharpen alike. A sheet of all rows per scene is written into the folder of the results.
 
     Attributes:
         scenes: of different names.
         config: settings of the multiscale rows; the geometry is chosen here.
         equal_time: whether to train the multiscale geometry once more, for as long as NeuS took.
-        test_views: at most so many of the held-out views are measured, evenly chosen.
+        test_views: the most held-out views that are measured, evenly chosen.
         resolution: of the marching cubes, of the exact surface as well.
         samples: points on each surface for Chamfer distances.
         neus_learning_rate: peak rate of the NeuS rows, where geometry and colours have the same.

@@ -71,7 +71,7 @@ class StepParts:
 class ReconstructRow:
     """One geometry, trained on one scene.
 
-    FLOPs are those of the matrix products of training; how they are counted is said in `flops`.
+    FLOPs are those of the matrix products of training; see `flops` for how they are counted.
 
     Attributes:
         scene: name of the scene or data set.

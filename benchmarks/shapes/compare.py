@@ -35,7 +35,7 @@ class ImageError:
 
     Attributes:
         everywhere: over all pixels; where both see the background, the difference is 0.
-        either: over the pixels of which at least a part sees the shape in one of the images.
+        either: over the pixels where at least a part sees the shape in one of the images.
         both: over the pixels that wholly see the shape in both images.
         pixels_either: how many those are.
         pixels_both: how many these are.

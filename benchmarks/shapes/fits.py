@@ -80,7 +80,7 @@ def kept_fit(directory: Path, cloud: PointCloud | Path, config: FitConfig, *, pr
 
     Raises:
         InputError: the cloud cannot be used.
-        Interrupted: the fit was asked to stop; the next call goes on with it.
+        Interrupted: the fit was stopped; the next call goes on with it.
     """
     if not is_fitted(directory):
         directory.parent.mkdir(parents=True, exist_ok=True)

@@ -102,7 +102,7 @@ class NormalMapBench(Benchmark[NormalMapRow]):
         views: how many cameras, evenly around the shape.
         up: "y" or "z".
         resolution: of the marching cubes of the coarsest level.
-        repeats: the best of so many is the time of an image.
+        repeats: runs per image; its time is the best of them.
         picture: a contact sheet: one line per camera, the original first.
     """
 

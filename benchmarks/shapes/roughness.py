@@ -1,9 +1,9 @@
 """Orange peel as figures: how a mesh's normals and heights differ from its reference's at high frequency.
 
-Mean distances hide dimples: their depth is small where their slopes are what the eye sees. So the difference of the
-normals, and the height of the mesh over the reference, lose their local means, and what is left is told apart by
-place: flat places of the reference, where every wave is an error, and the neighbourhood of its sharp edges, where a
-surface that was smoothed too much turns too early.
+Mean distances hide dimples: the depth of a dimple is small, and the eye sees its slope. So the local means are taken
+off the difference of the normals and off the height of the mesh over the reference. The remainders are sorted by place.
+On flat places of the reference every wave is an error. Near its sharp edges a surface that was smoothed too much turns
+too early.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ def roughness(
 
     With e = n' − n the difference of the unit normals at a point and h the height of the mesh's tangent plane over it,
     along n, the angle is 2 asin(|e − ē| / 2) and the height |h − h̄|. The bars are means over the reference's points
-    within ``radius`` whose normals are less than 30° from its own. A wave much shorter than ``radius`` stays as it is;
-    one of wavelength λ = 4 radius keeps 0.28 of itself (1 − 2 J₁(k r) / (k r), k = 2π/λ), a longer one less: shapes
-    that are only a little too thick are not rough.
+    within ``radius`` whose normals are less than 30° from its own. A wave much shorter than ``radius`` is not
+    changed. One of wavelength λ = 4 radius keeps 0.28 of itself (1 − 2 J₁(k r) / (k r), k = 2π/λ), a longer one less.
+    So shapes that are only a little too thick are not rough.
 
     Args:
         points: ``(N, 3)`` points uniform on the reference.
@@ -79,7 +79,7 @@ def roughness(
     edges = sharp_edge_points(reference, spacing=reach / 4)
     area = float(face_normals(reference)[1].sum())
     wanted = max(FEWEST, int(IN_DISC * area / (math.pi * radius**2)))
-    # Samples are in the order of the faces: every so many of them are spread evenly too.
+    # Samples are in the order of the faces, so that a regular choice of them is spread evenly too.
     chosen = np.linspace(0, len(points) - 1, min(wanted, len(points))).astype(np.int64)
     points, normals = points[chosen], normals[chosen]
     feet, feet_normals = feet[chosen], feet_normals[chosen]
@@ -87,7 +87,7 @@ def roughness(
     height = (feet_normals * (feet - points)).sum(axis=1) / np.maximum((feet_normals * normals).sum(axis=1), 0.5)
     both = np.concatenate((feet_normals - normals, height[:, None]), axis=1)
 
-    # Twice as many as on a flat place: folds have more, the furthest of which do not count.
+    # Twice as many as on a flat place: folds have more, and the furthest do not count.
     tree, count = KDTree(points, balanced_tree=False), min(2 * IN_DISC, len(points))
     found, index = (np.reshape(a, (len(points), -1)) for a in tree.query(points, count, 0, 2, radius, workers=-1))
     most = int(np.isfinite(found).sum(axis=1).max())

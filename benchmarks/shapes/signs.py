@@ -108,7 +108,7 @@ class SignsBench(Benchmark[SignsRow]):
         places = Places.around(CloudDistance(points, normals), seed=seed)
         device = choose_device(self.device)
         signs = give_signs(points, normals, config, device=device, places=places, report=work.stage(path.stem))
-        assert signs is not None  # nobody asks it to stop
+        assert signs is not None  # it gets no stop flag
         against = (cloud.normals * exact).sum(axis=1) < 0
         return [
             SignsRow(

@@ -155,7 +155,7 @@ class TextureBench(Benchmark[TextureRow]):
         return [Part(self.name, path.stem, (path,), (("image", _digest(mesh)),)) for path, mesh in found]
 
     def measure(self, cell: Part, work: Workplace) -> list[TextureRow]:
-        """See `Benchmark.measure`; raises `KeyboardInterrupt` where a texture was asked to stop."""
+        """See `Benchmark.measure`; raises `KeyboardInterrupt` where the training of a texture was stopped."""
         (path,), shape = cell.files, cell.name
         mesh = _read(path)
         configs = {"coarse": self.coarse} | ({} if self.full is None else {"full": self.full})
@@ -172,8 +172,8 @@ class TextureBench(Benchmark[TextureRow]):
         """A surface and its texture; whatever is not in the folder of the results yet is trained.
 
         Raises:
-            Interrupted: the fit was asked to stop; the next call resumes it.
-            KeyboardInterrupt: the texture was asked to stop; the next call trains it anew.
+            Interrupted: the fit was stopped; the next call resumes it.
+            KeyboardInterrupt: the texture was stopped; the next call trains it anew.
         """
         more = {"image": _digest(mesh), "points": FIT_POINTS, "texture": asdict(self.texture) | {"device": None}}
         run, progress = fit_home(work.out, path, config, **more), work.stage(f"{path.stem} {name}")
@@ -251,7 +251,7 @@ def _original(mesh: TexturedMesh, camera: Camera, samples: int) -> Drawing:
 
 @torch.inference_mode()
 def _traced(surface: Fitted, painted: Fitted, camera: Camera, samples: int) -> Drawing:
-    """The surface of one fit with the texture of another, both of which have the same similarity."""
+    """The surface of one fit with the texture of another, with the same similarity."""
     fine = camera.moved(surface.similarity).resized(camera.width * samples, camera.height * samples)
     device = painted.texture.delta.device
     seen = trace_view(surface.field, fine, device=device)

@@ -1,6 +1,7 @@
 """What commands share: converters, and how an interrupted one ends."""
 
 import argparse
+import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -21,12 +22,10 @@ from mplicits.pipelines.training.trainer import Interrupted
 )
 def test_converters_take_what_they_say(convert, good, bad, allowed):
     for text, number in good.items():
-        assert convert(text) == number
-        assert type(convert(text)) is type(number)
+        assert repr(convert(text)) == repr(number)
     for text in bad:
-        with pytest.raises(argparse.ArgumentTypeError) as caught:
+        with pytest.raises(argparse.ArgumentTypeError, match=re.escape(f"got {text!r}, expected {allowed}")):
             convert(text)
-        assert str(caught.value) == f"got {text!r}, expected {allowed}"
 
 
 @pytest.mark.parametrize(

@@ -20,26 +20,20 @@ def figures(text: str) -> dict[str, list[float]]:
     return {name: list(map(float, numbers)) for name, *numbers in rows}
 
 
-def test_the_picture_grows_level_by_level(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_picture_grows_level_by_level(tmp_path, monkeypatch, capsys):
     """It is in its place, and its path said, when a level is finished and the next one has not begun."""
     cloud = sample_sphere(500, radius=3.0)
-    write_cloud_ply(
-        tmp_path / "ball.ply", PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype("f4") / 3)
-    )
+    colored = PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype("f4") / 3)
+    write_cloud_ply(tmp_path / "ball.ply", colored)
     monkeypatch.setattr(module, "TILE", (24, 32))
-    there = []
-    written = module.write_picture
+    there, written, out = [], module.write_picture, tmp_path / "new" / "demo"
 
     def write(path: Path, image: np.ndarray) -> None:
         written(path, image)
-        run = tmp_path / "new" / "demo" / "run"
-        there.append((iio.imread(path).shape[1], (run / "resume.safetensors").exists()))
+        there.append((iio.imread(path).shape[1], (out / "run" / "resume.safetensors").exists()))
 
     monkeypatch.setattr(module, "write_picture", write)
-    out = tmp_path / "new" / "demo"
-    assert main(["demo", str(tmp_path / "ball.ply"), "-o", str(out), "--resolution", "24", *SMALL.split()]) == 0
+    assert main(f"demo {tmp_path}/ball.ply -o {out} --resolution 24 {SMALL}".split()) == 0
     widths, unfinished = zip(*there, strict=True)
     assert widths == tuple(sorted(set(widths)))  # cloud and level 0; level 1 beside them; the mesh
     assert unfinished == (True, True, False)
@@ -50,11 +44,10 @@ def test_the_picture_grows_level_by_level(
 
 
 @pytest.mark.slow
-def test_errors_are_those_of_closed_forms() -> None:
+def test_errors_are_those_of_closed_forms():
     """Of the statue itself they are 0, and of points beside it their distance."""
     statue = Statue()
     exact = sample_surface(statue, 5000)
-    assert exact.normals is not None
     off = 5e-4
     points = STATUE_PLACEMENT.to_input(exact.points + off * exact.normals.astype(np.float64))
     scan = replace(exact, points=points, normals=None)
@@ -70,8 +63,7 @@ def test_errors_are_those_of_closed_forms() -> None:
 
 
 @pytest.mark.slow
-def test_every_level_is_nearer_to_the_statue(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What the demo is there to show, at the scan's points."""
+def test_every_level_is_nearer_to_the_statue(tmp_path, capsys):
     assert main(["demo", "-o", str(tmp_path / "demo")]) == 0
     table = figures(capsys.readouterr().out)
     levels = np.array([row for name, row in table.items() if re.fullmatch(r"level \d, at the scan's points", name)])

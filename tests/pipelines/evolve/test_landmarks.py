@@ -1,24 +1,16 @@
 """Landmarks: what a file may hold, where it lands, and that a ball turns which nothing else would turn."""
 
-import dataclasses
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from evolutions import BRIEF, few_points
+from evolutions import BRIEF
 from mplicits.neural_fields import InputError, RigidMotion, flow
-from mplicits.pipelines.evolve import deform
+from mplicits.pipelines.evolve import shapes
 from mplicits.pipelines.evolve.deform import learn_motion, match
-from mplicits.pipelines.evolve.shapes import (
-    Landmarks,
-    Placement,
-    nearness,
-    placed_landmarks,
-    read_landmarks,
-    read_shape,
-)
+from mplicits.pipelines.evolve.shapes import Landmarks, Placement, placed_landmarks, read_landmarks, read_shape
 from mplicits.pipelines.evolve.train import evolve
 from mplicits.pipelines.training.settings import EvolveConfig
 
@@ -36,16 +28,6 @@ SMALL = replace(
 )
 
 
-@pytest.fixture(autouse=True)
-def _small(monkeypatch: pytest.MonkeyPatch) -> None:
-    few_points(monkeypatch)
-    monkeypatch.setattr(
-        deform,
-        "MOTION",
-        dataclasses.replace(deform.MOTION, pool=500, matched=150, guided=64, loose=32, regular=64, steps=4),
-    )
-
-
 def corners() -> torch.Tensor:
     """Six points of the ball, which a turn about z takes to six others."""
     return 0.5 * torch.cat((torch.eye(3), -torch.eye(3)))
@@ -56,25 +38,21 @@ def write(path: Path, before: torch.Tensor, after: torch.Tensor) -> str:
     return str(path)
 
 
-def test_lines_commas_and_comments(tmp_path: Path) -> None:
-    (tmp_path / "marks.txt").write_text(
-        "# head, then tail\n1 2 3 4 5 6\n\n-1, 0,1e-3, 0,0,7 # tail\n", encoding="utf-8"
-    )
+def test_lines_commas_and_comments(tmp_path):
+    (tmp_path / "marks.txt").write_text("# head, then tail\n1 2 3 4 5 6\n\n-1, 0,1e-3, 0,0,7 # tail\n")
     before, after = read_landmarks(tmp_path / "marks.txt")
     np.testing.assert_array_equal(before, [[1, 2, 3], [-1, 0, 1e-3]])
     np.testing.assert_array_equal(after, [[4, 5, 6], [0, 0, 7]])
 
 
 @pytest.mark.parametrize(("text", "said"), [("1 2 3", "line 1"), ("1 2 3 4 5 x", "line 1"), ("# none", "no landmarks")])
-def test_other_lines_are_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_other_lines_are_refused(tmp_path, text: str, said: str):
     (tmp_path / "marks.txt").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=said):
         read_landmarks(tmp_path / "marks.txt")
 
 
-def test_nan_and_missing_files_are_refused_before_shapes_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nan_and_missing_files_are_refused_before_shapes_are_read(tmp_path, monkeypatch):
     monkeypatch.setattr("mplicits.pipelines.evolve.train.read_shape", lambda _: pytest.fail("too late"))
     (tmp_path / "nan.txt").write_text("1 2 3 4 5 nan", encoding="utf-8")
     for name, said in (("nan.txt", "line 1"), ("none.txt", "none.txt")):
@@ -82,18 +60,16 @@ def test_nan_and_missing_files_are_refused_before_shapes_are_read(
             evolve(replace(SMALL, landmarks=(str(tmp_path / name),)))
 
 
-def test_one_file_for_each_two_shapes_of_a_deformation() -> None:
+def test_one_file_for_each_two_shapes_of_a_deformation():
     with pytest.raises(ValueError, match="2 files for 2 shapes"):
         replace(SMALL, landmarks=("a", "b"))
     with pytest.raises(ValueError, match="kind morph"):
         EvolveConfig(shapes=(BALL, BALL), landmarks=("a",))
 
 
-def test_they_go_where_their_shapes_go(tmp_path: Path) -> None:
+def test_they_go_where_their_shapes_go(tmp_path):
     path = write(tmp_path / "marks.txt", corners(), corners())
-    placement = Placement(
-        rotation=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), scale=0.5, shift=np.array([0.1, 0, 0])
-    )
+    placement = Placement(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), 0.5, np.array([0.1, 0, 0]))
     first, second = read_shape(BALL), read_shape(BALL).placed(placement)
     (found,) = placed_landmarks([path], [first, second])
     torch.testing.assert_close(found.before, corners())
@@ -104,20 +80,16 @@ def test_they_go_where_their_shapes_go(tmp_path: Path) -> None:
         placed_landmarks([write(tmp_path / "off.txt", corners(), 2 * corners())], [first, first])
 
 
-def test_the_guide_hears_them() -> None:
-    """Of a ball on itself the cheapest plan moves nothing, but that landmarks say that it has turned."""
+def test_landmarks_change_the_plan():
+    """Of a ball on itself the cheapest plan moves nothing; landmarks turn it."""
     ball, after = read_shape(BALL), TURN.forward(corners(), 1.0)
-    still = match(ball, ball, 0)
-    turned = match(ball, ball, 0, Landmarks(corners(), after))
-
-    def missed(found: tuple[torch.Tensor, ...]) -> float:
-        return float((found[1] - TURN.forward(found[0], 1.0)).norm(dim=1).mean())
-
-    assert missed(turned) < 0.5 * missed(still)
-    assert torch.equal(nearness(corners(), corners()).diagonal(), torch.ones(6))
+    plans = (match(ball, ball, 0), match(ball, ball, 0, Landmarks(corners(), after)))
+    still, turned = ((there - TURN.forward(x, 1.0)).norm(dim=1).mean() for x, there, *_ in plans)
+    assert turned < 0.5 * still
+    assert torch.equal(shapes.nearness(corners(), corners()).diagonal(), torch.ones(6))
 
 
-def test_a_ball_turns(tmp_path: Path) -> None:
+def test_a_ball_turns(tmp_path):
     ball, after = read_shape(BALL), TURN.forward(corners(), 1.0)
     config = replace(SMALL, landmarks=(write(tmp_path / "marks.txt", corners(), after),))
     velocity = learn_motion([ball, ball], (0.0, 1.0), config)

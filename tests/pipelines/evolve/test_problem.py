@@ -4,33 +4,21 @@ import functools
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from fields import small_spacetime
-from mplicits.neural_fields import (
-    Box,
-    InputError,
-    Moving,
-    MultiscaleSDF,
-    RigidMotion,
-    Similarity,
-    Siren,
-    SpaceTimeSDF,
-    Sphere,
-    Torus,
-    Union,
-    at_time,
-    extract_mesh,
-    save_field,
-)
+from mplicits import neural_fields
+from mplicits.neural_fields import Box, InputError, Moving, RigidMotion, Similarity, Sphere, Torus, Union, at_time
+from mplicits.neural_fields.checkpoint import save_field
 from mplicits.neural_fields.spacetime.field import spacetime_jet
 from mplicits.neural_fields.spacetime.flow import Solver, trajectories
 from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.evolve.objective import EvolveObjective
-from mplicits.pipelines.evolve.problem import between, build_problem, velocity_field
+from mplicits.pipelines.evolve.problem import Problem, between, build_problem, velocity_field
 from mplicits.pipelines.evolve.shapes import Placed, Placement, StaticShape, aligned, into_unit_sphere, read_shape
 from mplicits.pipelines.training.settings import EvolveConfig
 
@@ -39,18 +27,18 @@ TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 TURN *= np.sign(np.linalg.det(TURN))
 
 
-@pytest.fixture(autouse=True)
-def _few_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evolve_problem, "END_POINTS", 500)
-    monkeypatch.setattr(evolve_problem, "REACH_POINTS", 200)
+def built(**settings: Any) -> Problem:
+    """The problem of exact shapes, and of few samples."""
+    config = replace(CONFIG, **settings)
+    return build_problem([read_shape(text) for text in config.shapes], config)
 
 
 def shape_of(field, *, similarity: Similarity | None = None) -> StaticShape:
-    mesh = extract_mesh(field, resolution=48)
+    mesh = neural_fields.extract_mesh(field, resolution=48)
     return StaticShape("made", field, similarity or Similarity.identity(), mesh)
 
 
-def test_a_placement_and_its_inverse() -> None:
+def test_a_placement_and_its_inverse():
     there = Placement(TURN, 0.5, np.array([0.1, 0.2, -0.3]))
     points = np.random.default_rng(0).normal(size=(50, 3))
     assert np.allclose(there.inverse().apply(there.apply(points)), points)
@@ -60,7 +48,7 @@ def test_a_placement_and_its_inverse() -> None:
     assert np.array_equal(again.apply(points), there.apply(points))
 
 
-def test_a_placed_field_is_the_moved_shape() -> None:
+def test_a_placed_field_is_the_moved_shape():
     placement = Placement(TURN, 0.5, np.array([0.1, 0.2, -0.3]))
     box = Box(half_size=(0.5, 0.3, 0.4)).double()
     placed = Placed(box, placement).double()
@@ -72,7 +60,7 @@ def test_a_placed_field_is_the_moved_shape() -> None:
     assert torch.equal(jet.value, placed.value(moved))
 
 
-def test_exact_shapes_are_read() -> None:
+def test_exact_shapes_are_read():
     shape = read_shape("torus:0.4,0.15@0.1,0,-0.2")
     x = 2 * torch.rand(100, 3) - 1
     exact = Torus(major=0.4, minor=0.15).value(x - torch.tensor([0.1, 0.0, -0.2]))
@@ -84,22 +72,20 @@ def test_exact_shapes_are_read() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("cube", "cube: no such run directory or file, and no exact shape; those are sphere, torus, box, capsule"),
-        ("sphere:big", "sphere:big: got 'big', expected 1 number with commas"),
+        ("cube", "cube: no such run directory or file, and no exact shape"),
+        ("sphere:big", "sphere:big: got 'big'"),
         ("torus:0.4", "torus:0.4: got '0.4', expected 2 numbers"),
         ("sphere:0.4@1,2", "got '1,2', expected 3 numbers"),
-        ("sphere:-1", "sphere:-1: radius=-1.0: expected > 0"),
-        ("sphere:7", "sphere:7: has no surface in the unit sphere"),
+        ("sphere:-1", "sphere:-1: radius"),
+        ("sphere:7", "sphere:7: has no surface"),
     ],
 )
-def test_bad_shapes_are_named(text: str, message: str) -> None:
-    with pytest.raises(InputError) as caught:
+def test_bad_shapes_are_named(text: str, message: str):
+    with pytest.raises(InputError, match=rf"^[^\n]*{message}[^\n]*$"):
         read_shape(text)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
-def test_beyond_its_unit_sphere_a_fit_has_no_parts(tmp_path) -> None:
+def test_beyond_its_unit_sphere_a_fit_has_no_parts(tmp_path):
     file = tmp_path / "fit.safetensors"
     save_field(file, Union(Sphere(radius=0.3), Sphere(radius=0.2, center=(2.0, 0.0, 0.0))))
     field = read_shape(str(file)).field
@@ -108,14 +94,13 @@ def test_beyond_its_unit_sphere_a_fit_has_no_parts(tmp_path) -> None:
     assert torch.equal(field.value(x), Sphere(radius=0.3).value(x))
 
 
-def test_a_field_that_moves_already_is_refused(tmp_path) -> None:
-    file = tmp_path / "moving.safetensors"
-    save_field(file, small_spacetime())
+def test_a_field_that_moves_already_is_refused(tmp_path):
+    save_field(tmp_path / "moving.safetensors", small_spacetime())
     with pytest.raises(InputError, match="moves already"):
-        read_shape(str(file))
+        read_shape(str(tmp_path / "moving.safetensors"))
 
 
-def test_alignment_none_keeps_input_coordinates() -> None:
+def test_alignment_none_keeps_input_coordinates():
     # Two fits of one ball of radius 5 around (10, 0, 0), each in a unit sphere of its own.
     first = shape_of(Sphere(radius=0.5), similarity=Similarity((10.0, 0.0, 0.0), 10.0))
     second = shape_of(Sphere(radius=0.25, center=(0.1, 0.0, 0.0)), similarity=Similarity((8.0, 0.0, 0.0), 20.0))
@@ -127,7 +112,7 @@ def test_alignment_none_keeps_input_coordinates() -> None:
     assert kept is second
 
 
-def test_alignment_pca_turns_a_shape_back() -> None:
+def test_alignment_pca_turns_a_shape_back():
     """The shape has no symmetry, so that only one of the four ways round is right."""
     lump = Union(Box(half_size=(0.5, 0.3, 0.2)), Sphere(radius=0.2, center=(0.45, 0.3, 0.15)))
     first = shape_of(lump)
@@ -138,7 +123,7 @@ def test_alignment_pca_turns_a_shape_back() -> None:
     assert (second.field.value(x) - first.field.value(x)).abs().mean() > 0.05
 
 
-def test_what_reaches_too_far_is_shrunk() -> None:
+def test_what_reaches_too_far_is_shrunk():
     shapes, region = into_unit_sphere([read_shape("sphere:0.5@0.5,0,0")], np.array([[0.0, 0, 0], [3.0, 0, 0]]))
     assert region == Similarity((1.5, 0.0, 0.0), 1.5)
     x = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
@@ -148,9 +133,8 @@ def test_what_reaches_too_far_is_shrunk() -> None:
     assert into_unit_sphere(kept, np.array([[1.0, 0.0, 0.0]])) == (kept, Similarity.identity())
 
 
-def test_transport_by_rigid_motions_is_known_exactly_and_unions_too() -> None:
-    config = replace(
-        CONFIG,
+def test_transport_by_rigid_motions_is_known_exactly_and_unions_too():
+    problem = built(
         kind="transport",
         shapes=("sphere:0.3@-0.5,0,0", "torus:0.3,0.1@0.4,0,0"),
         velocity=(0.4, 0.0, 0.1, -0.3, 0.0, 0.0),
@@ -158,7 +142,6 @@ def test_transport_by_rigid_motions_is_known_exactly_and_unions_too() -> None:
         axis=(0.0, 0.0, 1.0, 1.0, 1.0, 0.0),
         center=(0.0, 0.0, 0.0, 0.4, 0.0, 0.0),
     )
-    problem = build_problem([read_shape(text) for text in config.shapes], config)
     placed = Placed(Torus(major=0.3, minor=0.1), Placement(shift=np.array([0.4, 0.0, 0.0])))
     turning = RigidMotion(axis=(1.0, 1.0, 0.0), angle=2.0, center=(0.4, 0.0, 0.0), velocity=(-0.3, 0.0, 0.0))
     parts = [
@@ -181,9 +164,8 @@ def test_transport_by_rigid_motions_is_known_exactly_and_unions_too() -> None:
     assert [end.time for end in problem.ends] == [0.0, 1.0]
 
 
-def test_transport_out_of_the_unit_sphere_shrinks_the_stage() -> None:
-    config = replace(CONFIG, kind="transport", shapes=("sphere:0.5",), velocity=(2.0, 0.0, 0.0))
-    problem = build_problem([read_shape("sphere:0.5")], config)
+def test_transport_out_of_the_unit_sphere_shrinks_the_stage():
+    problem = built(kind="transport", shapes=("sphere:0.5",), velocity=(2.0, 0.0, 0.0))
     scale = problem.similarity.scale
     assert scale == pytest.approx(1.5, abs=0.01)
     assert problem.similarity.center == pytest.approx((1.0, 0.0, 0.0), abs=0.01)
@@ -194,9 +176,8 @@ def test_transport_out_of_the_unit_sphere_shrinks_the_stage() -> None:
     assert (scale * problem.known.value - (Sphere(radius=0.5).value(x - travelled))).abs().max() < 1e-4
 
 
-def test_a_twist_gives_surface_points_normals_and_signs() -> None:
-    config = replace(CONFIG, kind="transport", shapes=("box:0.3,0.2,0.5",), twist=(1.5,))
-    problem = build_problem([read_shape("box:0.3,0.2,0.5")], config)
+def test_a_twist_gives_surface_points_normals_and_signs():
+    problem = built(kind="transport", shapes=("box:0.3,0.2,0.5",), twist=(1.5,))
     box = Box(half_size=(0.3, 0.2, 0.5))
 
     def untwisted(points: torch.Tensor) -> torch.Tensor:
@@ -219,7 +200,7 @@ def test_a_twist_gives_surface_points_normals_and_signs() -> None:
     assert problem.law is not None
 
 
-def test_the_velocity_of_a_twist_is_the_derivative_of_the_motion() -> None:
+def test_the_velocity_of_a_twist_is_the_derivative_of_the_motion():
     velocity = velocity_field(RigidMotion(angle=0.5, velocity=(0.1, 0.0, 0.2)), 1.5)
     x0 = 2 * torch.rand(50, 3, dtype=torch.float64) - 1
     drift = torch.tensor([0.1, 0.0, 0.2], dtype=torch.float64)
@@ -236,7 +217,7 @@ def test_the_velocity_of_a_twist_is_the_derivative_of_the_motion() -> None:
     assert torch.allclose(found, expected, atol=1e-8)
 
 
-def test_bounds_between_shapes() -> None:
+def test_bounds_between_shapes():
     values = torch.tensor([[0.1, 0.3, 9.0], [0.1, -0.3, 9.0], [-0.1, -0.3, 9.0], [9.0, 0.2, 0.4], [9.0, -0.2, -0.1]])
     low, high = between(torch.tensor([0.1, 0.2, 0.3, 0.6, 0.9]), (0.0, 0.5, 1.0), values)
     inf = math.inf
@@ -244,9 +225,8 @@ def test_bounds_between_shapes() -> None:
     assert torch.allclose(high, torch.tensor([inf, inf, -0.1, inf, -0.1]))
 
 
-def test_a_morph_knows_its_shapes_and_bounds_what_is_between() -> None:
-    config = replace(CONFIG, shapes=("sphere:0.4", "sphere:0.7"))
-    problem = build_problem([read_shape(text) for text in config.shapes], config)
+def test_a_morph_knows_its_shapes_and_bounds_what_is_between():
+    problem = built(shapes=("sphere:0.4", "sphere:0.7"))
     for time, radius in ((0.0, 0.4), (1.0, 0.7)):
         here = problem.known.take((problem.known.points[:, 3] == time).nonzero()[:, 0])
         assert len(here) == 1000
@@ -256,28 +236,25 @@ def test_a_morph_knows_its_shapes_and_bounds_what_is_between() -> None:
     for radius in (0.4, 0.55, 0.7):
         assert bool((length - radius >= problem.bounds.low - 1e-5).all())
         assert bool((length - radius <= problem.bounds.high + 1e-5).all())
-    inside, outside = length < 0.4, length > 0.7
-    assert bool((inside | outside).all())
+    assert bool(((length < 0.4) | (length > 0.7)).all())
     assert len(problem.bounds) > 500
-    assert problem.law is not None
     # The law of concentric spheres: r grows by 0.3 in unit time; the distance falls by as much everywhere.
     growing = ShrinkingSphere(radius=0.5, alpha=-1e-9)
     jet = spacetime_jet(growing, 0.1 + 0.8 * torch.rand(100, 4))
     assert torch.allclose(problem.law.rate(jet), torch.full((100,), -0.3), atol=1e-4)
 
 
-def test_the_law_counts_per_interval_between_keys() -> None:
-    config = replace(CONFIG, shapes=("sphere:0.4", "sphere:0.7"))
-    problem = build_problem([read_shape(text) for text in config.shapes], config)
+def test_the_law_counts_per_interval_between_keys():
+    problem = built(shapes=("sphere:0.4", "sphere:0.7"))
     assert problem.keys == (0.0, 1.0)
 
     def law(keys: tuple[float, ...]) -> float:
         generator = torch.Generator().manual_seed(0)
-        field = SpaceTimeSDF(MultiscaleSDF(Siren(8, 1, in_dim=4), [], []))
+        field = neural_fields.SpaceTimeSDF.from_widths([(8, 1)], omegas=[30])
         with torch.no_grad():
             for parameter in field.parameters():
                 parameter.copy_(torch.randn(parameter.shape, generator=generator))
-        objective = EvolveObjective(field, replace(problem, keys=keys), config, level=0, generator=generator)
+        objective = EvolveObjective(field, replace(problem, keys=keys), CONFIG, level=0, generator=generator)
         return float(objective.losses(0, 0.0)[0]["law"].detach())
 
     once = law((0.0, 1.0))
@@ -286,46 +263,40 @@ def test_the_law_counts_per_interval_between_keys() -> None:
     assert once / 16 < law((0.0, 0.25, 1.0)) < once * 9 / 16
 
 
-def test_smoothing_is_bounded_by_the_sphere_around_the_shape() -> None:
-    config = replace(CONFIG, kind="smooth", shapes=("sphere:0.8",), alpha=0.12)
-    problem = build_problem([read_shape("sphere:0.8")], config)
+def test_smoothing_is_bounded_by_the_sphere_around_the_shape():
+    problem = built(kind="smooth", shapes=("sphere:0.8",), alpha=0.12)
     truth = ShrinkingSphere(radius=0.8, alpha=0.12)
     value = truth.value(problem.bounds.points)
     assert len(problem.bounds) > 500
     assert bool((value >= problem.bounds.low - 1e-3).all())
     assert bool((problem.known.points[:, 3] == 0).all())
-    x = problem.ends[0].points
-    assert problem.law is not None
-    jet = spacetime_jet(truth, at_time(1.1 * x, 0.5), order=2)
+    jet = spacetime_jet(truth, at_time(1.1 * problem.ends[0].points, 0.5), order=2)
     assert problem.law.residual(jet).abs().max() < 1e-4
-    swelling = build_problem([read_shape("sphere:0.8")], replace(config, alpha=-0.01))
-    assert not len(swelling.bounds)
+    assert not len(built(kind="smooth", shapes=("sphere:0.8",), alpha=-0.01).bounds)
 
 
 @pytest.mark.parametrize(("kind", "count"), [("morph", 1), ("smooth", 2), ("transport", 0)])
-def test_the_number_of_shapes_is_checked(kind, count: int) -> None:
+def test_the_number_of_shapes_is_checked(kind, count: int):
     with pytest.raises(InputError, match=f"{count} shapes for kind {kind}; expected"):
-        build_problem([read_shape("sphere")] * count, replace(CONFIG, kind=kind))
+        built(kind=kind, shapes=("sphere",) * count)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"shapes": ("a", "b"), "times": (0.0, 0.5)}, "times: (0.0, 0.5); expected growing numbers from 0 to 1"),
-        ({"shapes": ("a", "b"), "times": (0.0,)}, "times: 1 numbers for 2 shapes"),
-        ({"velocity": (1.0, 2.0)}, "velocity: 2 numbers; expected 3, or 3 per shape"),
-        ({"axis": (0.0, 0.0, 0.0)}, "axis: (0.0, 0.0, 0.0); expected a vector of non-zero length"),
+        ({"shapes": ("a", "b"), "times": (0.0, 0.5)}, r"times: \(0.0, 0.5\)"),
+        ({"shapes": ("a", "b"), "times": (0.0,)}, "times: 1 numbers"),
+        ({"velocity": (1.0, 2.0)}, "velocity: 2 numbers"),
+        ({"axis": (0.0, 0.0, 0.0)}, r"axis: \(0.0, 0.0, 0.0\)"),
     ],
 )
-def test_settings_out_of_range_are_named(settings: dict, message: str) -> None:
-    with pytest.raises(ValueError, match="expected") as caught:
+def test_settings_out_of_range_are_named(settings: dict, message: str):
+    with pytest.raises(ValueError, match=message):
         EvolveConfig(**settings)
-    assert message in str(caught.value)
 
 
-def test_a_motion_that_cannot_be_followed_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_motion_that_cannot_be_followed_is_bad_input(monkeypatch):
     soon = functools.partial(trajectories, solver=Solver(max_steps=50))
     monkeypatch.setattr(evolve_problem, "trajectories", soon)
-    config = replace(CONFIG, kind="transport", shapes=("sphere",), angle=(1e7,))
     with pytest.raises(InputError, match=r"the motion cannot be followed .*reached time"):
-        build_problem([read_shape("sphere")], config)
+        built(kind="transport", shapes=("sphere",), angle=(1e7,))

@@ -1,17 +1,16 @@
 """Clouds and meshes as shapes: each is fitted once, and poses of one mesh are landmarks of each other."""
 
-import dataclasses
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from evolutions import QUICK, fails, few_points
+from evolutions import QUICK, fails
 from mplicits.neural_fields import Similarity, Sphere, save_field
 from mplicits.neural_fields.backend.files import write_json
 from mplicits.pipelines.cli.entry import main
-from mplicits.pipelines.evolve import deform, scans
+from mplicits.pipelines.evolve import scans
 from mplicits.pipelines.evolve.scans import fits_beside, fitted_scans, scans_among
 from mplicits.pipelines.evolve.shapes import read_landmarks
 from mplicits.pipelines.surface.surface import read_surface
@@ -34,7 +33,7 @@ SHIFT = np.array([0.3, 0.1, 0.0])
 
 
 @pytest.fixture
-def poses(tmp_path: Path) -> list[str]:
+def poses(tmp_path) -> list[str]:
     """A ball of 162 vertices, and the same one stretched and moved."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     files = [str(tmp_path / f"{name}.ply") for name in ("first", "second")]
@@ -43,9 +42,7 @@ def poses(tmp_path: Path) -> list[str]:
     return files
 
 
-def test_poses_of_one_mesh_are_fitted_once_and_are_landmarks(
-    poses: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_poses_of_one_mesh_are_fitted_once_and_are_landmarks(poses: list[str], tmp_path, monkeypatch):
     monkeypatch.setattr(scans, "fit", ball_for)
     config = replace(QUICK, kind="deform", velocity=(0.0, 0.0, 0.0), shapes=(poses[0], poses[1], "sphere:0.4"))
     found = scans_among(config.shapes)
@@ -70,7 +67,7 @@ def test_poses_of_one_mesh_are_fitted_once_and_are_landmarks(
     assert [str(file) for file in again] == poses
 
 
-def test_other_faces_and_clouds_are_no_poses(poses: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_other_faces_and_clouds_are_no_poses(poses: list[str], tmp_path, monkeypatch):
     monkeypatch.setattr(scans, "fit", lambda *_, **__: None)
     monkeypatch.setattr(scans, "_on_fit", lambda _run, vertices: np.zeros(len(vertices), bool))
     config = replace(QUICK, kind="deform", velocity=(0.0, 0.0, 0.0), shapes=tuple(poses))
@@ -85,15 +82,7 @@ def test_other_faces_and_clouds_are_no_poses(poses: list[str], tmp_path: Path, m
 
 
 @pytest.mark.slow
-def test_a_series_of_scans_on_the_command_line(
-    poses: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-):
-    few_points(monkeypatch)
-    monkeypatch.setattr(
-        deform,
-        "MOTION",
-        dataclasses.replace(deform.MOTION, pool=500, matched=100, guided=32, loose=32, regular=64, steps=2),
-    )
+def test_a_series_of_scans_on_the_command_line(poses: list[str], tmp_path, capsys):
     fits = tmp_path / "fits.yaml"
     fits.write_text(
         "widths: [16]\ndepths: [1]\nomegas: [4]\nsteps: [30]\nlearning_rates: [1.0e-2]\nbatch: 256\nsamples: 1000\n"
@@ -113,7 +102,7 @@ def test_a_series_of_scans_on_the_command_line(
     assert record["finished"]
 
 
-def test_bad_scans_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_bad_scans_are_named(tmp_path, capsys):
     bad = tmp_path / "bad.ply"
     bad.write_text("no ply")
     assert str(bad) in fails(capsys, f"evolve {bad} sphere -o {tmp_path / 'run'}")

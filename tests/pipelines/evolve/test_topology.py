@@ -65,10 +65,9 @@ def test_what_vanishes_is_found_where_it_was():
 
 
 def test_changes_are_recorded_in_input_coordinates():
+    field, place = FunctionField(meeting, in_dim=4), Similarity((5.0, 0.0, 0.0), 2.0)
     ends = [End(name, time, torch.eye(3), 0.9 * torch.eye(3)) for name, time in (("a", 0.0), ("b", 1.0))]
-    checks = check_evolution(
-        FunctionField(meeting, in_dim=4), ends, Similarity((5.0, 0.0, 0.0), 2.0), frames=3, resolution=24
-    )
+    checks = check_evolution(field, ends, place, frames=3, resolution=24)
     (change,) = checks["changes"]
     assert change["before"] == {"components": 2, "holes": 0}
     assert change["place"] == pytest.approx([5.2, 0.4, 0.0], abs=2 * 0.3)
@@ -84,7 +83,7 @@ def test_more_pieces_than_at_either_end_are_warned_about():
     assert not warnings({"frames": frames, "ends": ends[:1]})
 
 
-def test_of_many_changes_the_first_ones_have_a_place(monkeypatch: pytest.MonkeyPatch):
+def test_of_many_changes_the_first_ones_have_a_place(monkeypatch):
     monkeypatch.setattr(topology, "CHANGES", dataclasses.replace(CHANGES, placed=1))
 
     def blinking(x: Tensor) -> Tensor:

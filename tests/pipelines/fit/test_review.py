@@ -86,7 +86,6 @@ def test_the_far_side_of_a_plate_that_the_level_takes_for_one_sheet(thickness: f
 
 
 def test_a_fit_turns_what_its_first_level_contradicts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Levels above learn from the turned normals, and the run says how many there were."""
     raw = sample_torus(4000)
 
     def spoilt(cloud: PointCloud, config: FitConfig) -> OrientedCloud:

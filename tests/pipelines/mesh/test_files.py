@@ -1,14 +1,10 @@
-import json
-import re
-import struct
-
 import numpy as np
 import pytest
 import trimesh
+from glb import attribute, glb_parts
 from mplicits.datasets import linear_to_srgb, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere
 from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
-from mplicits.neural_fields.meshing.mesh import needs_doubles
 from mplicits.pipelines.mesh.files import check_mesh_path, write_mesh
 from mplicits.pipelines.surface.surface import read_surface
 
@@ -23,12 +19,6 @@ def mesh():
     return Mesh(plain.vertices, plain.faces, plain.normals, colors)
 
 
-def glb_header(data):
-    length = struct.unpack("<I", data[12:16])[0]
-    assert struct.unpack("<I", data[8:12])[0] == len(data)
-    return json.loads(data[20 : 20 + length]), data[28 + length :]
-
-
 def stored_normals(path):
     """Normals as they stand in the file: mesh readers prefer to compute their own."""
     if path.suffix.lower() == ".ply":
@@ -36,20 +26,13 @@ def stored_normals(path):
     if path.suffix == ".obj":
         lines = [line.split()[1:] for line in path.read_text().splitlines() if line.startswith("vn ")]
         return np.array(lines, np.float64)
-    return glb_attribute(path, "NORMAL", "<f4", 3)
+    return attribute(path, "NORMAL")
 
 
 def stored_colors(path):
     if path.suffix == ".glb":  # linear by its standard; 65535 is 1
-        return linear_to_srgb(glb_attribute(path, "COLOR_0", "<u2", 4)[:, :3] / 65535)
+        return linear_to_srgb(attribute(path, "COLOR_0")[:, :3] / 65535)
     return read_surface(path).colors
-
-
-def glb_attribute(path, name, kind, channels):
-    header, body = glb_header(path.read_bytes())
-    accessor = header["accessors"][header["meshes"][0]["primitives"][0]["attributes"][name]]
-    start = header["bufferViews"][accessor["bufferView"]]["byteOffset"]
-    return np.frombuffer(body, kind, channels * accessor["count"], start).reshape(-1, channels)
 
 
 @pytest.mark.parametrize("similarity", [NEAR, UTM], ids=["near", "utm"])
@@ -88,8 +71,6 @@ def test_ply_is_double_only_where_needed(tmp_path, mesh):
     for similarity, word in ((NEAR, b"float x"), (UTM, b"double x")):
         write_mesh(tmp_path / "mesh.ply", mesh, similarity)
         assert word in (tmp_path / "mesh.ply").read_bytes()[:400]
-    assert not needs_doubles(NEAR)
-    assert needs_doubles(UTM)
 
 
 def test_ply_is_read_as_a_cloud_too(tmp_path, mesh):
@@ -101,14 +82,14 @@ def test_ply_is_read_as_a_cloud_too(tmp_path, mesh):
 
 def test_glb_records_its_origin(tmp_path, mesh):
     write_mesh(tmp_path / "mesh.glb", mesh, UTM)
-    (node,) = glb_header((tmp_path / "mesh.glb").read_bytes())[0]["nodes"]
+    (node,) = glb_parts(tmp_path / "mesh.glb")[0]["nodes"]
     assert node["translation"] == node["extras"]["origin"] == list(UTM.center)
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("mesh.xyz", r"unknown mesh format '\.xyz'; use one of \.ply, \.obj, \.stl, \.glb"),
+        ("mesh.xyz", "unknown mesh format"),
         ("mesh", "no extension"),
         ("file/deeper/mesh.ply", "file is no folder"),
         ("folder.ply", "is a folder"),
@@ -131,7 +112,7 @@ def test_failure_keeps_the_old_file(tmp_path, mesh, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(type(target), "replace", full)
-    with pytest.raises(InputError, match=re.escape("No space left on device")):
+    with pytest.raises(InputError, match="No space left on device"):
         write_mesh(target, mesh)
     assert target.read_text() == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["mesh.ply"]

@@ -5,11 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
+from evolutions import fails
+from mplicits import neural_fields
 from mplicits.neural_fields import Box, Mesh, Similarity, Sphere, Union, extract_mesh, load_field, save_field
-from mplicits.pipelines.cli import entry as cli
-from mplicits.pipelines.mesh.solids import length_in
+from mplicits.neural_fields.shape import in_one_frame
+from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.mesh import solids
 from mplicits.pipelines.surface.distance import MeshField
+from mplicits.pipelines.surface.surface import Support
 from mplicits.pipelines.training.trainer import parameter_count
 
 RADIUS, OTHER, APART = 30.0, 25.0, 35.0  # millimetres
@@ -25,11 +30,15 @@ def ball(path: Path, radius: float, offset: float = 0.0) -> Path:
 
 
 @pytest.fixture
-def balls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def balls(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     ball(Path("a.safetensors"), RADIUS)
     ball(Path("b.safetensors"), OTHER, APART)
     return tmp_path
+
+
+def run(line: str) -> None:
+    assert main(line.split()) == 0
 
 
 def volume_of_lens() -> float:
@@ -45,12 +54,12 @@ A, B = 4 / 3 * math.pi * RADIUS**3, 4 / 3 * math.pi * OTHER**3
     ("operation", "exact"),
     [("union", A + B - volume_of_lens()), ("intersection", volume_of_lens()), ("difference", A - volume_of_lens())],
 )
-def test_two_balls(balls: Path, operation: str, exact: float) -> None:
-    second = "b.stl" if operation == "difference" else "b.safetensors"
-    if second == "b.stl":
-        assert cli.main(["mesh", "b.safetensors", "-o", "b.stl", "--resolution", "96"]) == 0
-    words = f"boolean a.safetensors {second} --{operation} -o out.ply --resolution {RESOLUTION}"
-    assert cli.main(words.split()) == 0
+def test_two_balls(balls: Path, operation: str, exact: float):
+    second = "b.safetensors"
+    if operation == "difference":
+        second = "b.stl"
+        run("mesh b.safetensors -o b.stl --resolution 96")
+    run(f"boolean a.safetensors {second} --{operation} -o out.ply --resolution {RESOLUTION}")
     mesh = trimesh.load_mesh("out.ply")
     assert mesh.is_watertight
     # Of the frame around both: cells of 2.14 scales / resolution; see test_algebra.test_volumes_of_two_balls.
@@ -62,18 +71,17 @@ def test_two_balls(balls: Path, operation: str, exact: float) -> None:
     assert abs(A + B - volume_of_lens() - A) > 2 * allowed  # the operations differ by more
 
 
-def test_a_field_of_two_runs_is_meshed_later(balls: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_field_of_two_runs_is_meshed_later(balls: Path, capsys):
     assert (
-        cli.main(["boolean", "a.safetensors", "b.safetensors", "--union", "--smooth", "4", "-o", "both.safetensors"])
-        == 0
+        main(["boolean", "a.safetensors", "b.safetensors", "--union", "--smooth", "4", "-o", "both.safetensors"]) == 0
     )
     saved = load_field("both.safetensors")
     assert isinstance(saved.field, Union)
     assert abs(saved.field.smooth * saved.similarity.scale - 4) < 1e-9
     assert parameter_count(saved.field) == 0
     assert "closed, volume" in capsys.readouterr().out
-    assert cli.main(["mesh", "both.safetensors", "-o", "both.ply", "--resolution", "48"]) == 0
-    assert cli.main(["info", "both.safetensors"]) == 0
+    run("mesh both.safetensors -o both.ply --resolution 48")
+    run("info both.safetensors")
     assert "Union" in capsys.readouterr().out
 
 
@@ -81,10 +89,9 @@ def test_a_field_of_two_runs_is_meshed_later(balls: Path, capsys: pytest.Capture
     ("by", "flags"), [("2mm", "--unit mm"), ("0.2cm", "--unit mm"), ("2", ""), ("-2mm", "--unit mm")]
 )
 @pytest.mark.parametrize("source", ["a.safetensors", "a.stl"])
-def test_a_ball_is_grown_and_shrunk(balls: Path, by: str, flags: str, source: str) -> None:
-    assert cli.main(f"mesh a.safetensors -o a.stl --resolution {RESOLUTION}".split()) == 0
-    words = f"offset {source} --by {by} -o out.ply --resolution {RESOLUTION} {flags}"
-    assert cli.main(words.split()) == 0
+def test_a_ball_is_grown_and_shrunk(balls: Path, by: str, flags: str, source: str):
+    run(f"mesh a.safetensors -o a.stl --resolution {RESOLUTION}")
+    run(f"offset {source} --by {by} -o out.ply --resolution {RESOLUTION} {flags}")
     mesh = trimesh.load_mesh("out.ply")
     if flags:  # PLY is in metres where the unit is known
         mesh.apply_scale(1000)
@@ -99,8 +106,8 @@ def test_a_ball_is_grown_and_shrunk(balls: Path, by: str, flags: str, source: st
 
 
 @pytest.mark.parametrize(("by", "inner", "outer"), [("-5", RADIUS - 5, RADIUS), ("5", RADIUS, RADIUS + 5)])
-def test_a_hollow_ball(balls: Path, by: str, inner: float, outer: float) -> None:
-    assert cli.main(f"offset a.safetensors --by {by} --shell -o out.stl --resolution 40".split()) == 0
+def test_a_hollow_ball(balls: Path, by: str, inner: float, outer: float):
+    run(f"offset a.safetensors --by {by} --shell -o out.stl --resolution 40")
     mesh = trimesh.load_mesh("out.stl")
     assert mesh.is_watertight
     assert mesh.body_count == 2  # the wall's two sides
@@ -109,16 +116,12 @@ def test_a_hollow_ball(balls: Path, by: str, inner: float, outer: float) -> None
     assert abs(mesh.volume - exact) < 2 * 4 * math.pi * (outer**2 + inner**2) * 3 * step**2 / (8 * inner)
 
 
-def test_a_mesh_is_an_exact_distance() -> None:
+def test_a_mesh_is_an_exact_distance():
     box = trimesh.creation.box((1.0, 0.6, 0.8))
     surface = Mesh(np.asarray(box.vertices), np.asarray(box.faces)[:, ::-1].astype(np.int64))  # inside out
     field, exact = MeshField(surface), Box(half_size=(0.5, 0.3, 0.4))
-    import torch
-
     x = 2 * torch.rand(500, 3, dtype=torch.float64) - 1
-    mine, theirs = field.jet(x), exact.jet(x)
-    torch.testing.assert_close(mine.value, theirs.value, rtol=0, atol=1e-12)
-    torch.testing.assert_close(mine.gradient, theirs.gradient, rtol=0, atol=1e-12)
+    torch.testing.assert_close(field.jet(x)[:2], exact.jet(x)[:2], rtol=0, atol=1e-12)
     assert abs(field.volume - 0.48) < 1e-12
     assert abs(extract_mesh(field, resolution=32).vertices).max() < 0.5 + 1e-6
     on_face = torch.tensor([[0.5, 0.1, 0.1]], dtype=torch.float64)
@@ -131,8 +134,8 @@ def test_a_mesh_is_an_exact_distance() -> None:
     ("text", "unit", "expected"),
     [("2mm", "m", 0.002), ("1in", "mm", 25.4), ("-0.5", None, -0.5), ("1e-3m", "mm", 1.0), (" .5 cm", "mm", 5.0)],
 )
-def test_lengths(text: str, unit: str | None, expected: float) -> None:
-    assert abs(length_in(text, unit, "--by") - expected) < 1e-12 * abs(expected)
+def test_lengths(text: str, unit: str | None, expected: float):
+    assert abs(solids.length_in(text, unit, "--by") - expected) < 1e-12 * abs(expected)
 
 
 @pytest.mark.parametrize(
@@ -156,27 +159,19 @@ def test_lengths(text: str, unit: str | None, expected: float) -> None:
         ("offset a.safetensors --by 2 --time 0.5 -o o.stl", "does not move"),
     ],
 )
-def test_one_line_says_what_is_wrong(balls: Path, capsys: pytest.CaptureFixture[str], words: str, message: str) -> None:
+def test_one_line_says_what_is_wrong(balls: Path, capsys, words: str, message: str):
     ball(Path("far.safetensors"), RADIUS, 500.0)
     box = trimesh.creation.box((1.0, 0.6, 0.8))
     box.export("box.ply")
     trimesh.Trimesh(box.vertices, box.faces[1:], process=False).export("open.ply")
-    assert cli.main(words.split()) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
+    assert message in fails(capsys, words)
     assert not Path("o.ply").exists()
 
 
-def test_blobs_are_not_joined(tmp_path: Path) -> None:
+def test_blobs_are_not_joined(tmp_path):
     """What no points of a run support is left out of the union, unless the mesh beside it reaches there."""
-    from mplicits.neural_fields import WorldField
-    from mplicits.neural_fields.shape import in_one_frame
-    from mplicits.pipelines.mesh import solids
-    from mplicits.pipelines.surface.surface import Support
-
-    scan = WorldField(Union(Sphere(radius=0.4), Sphere(radius=0.15, center=(0.0, 0.0, 0.75))))
-    other = WorldField(Sphere(radius=0.2, center=(0.7, 0.0, 0.0)))
+    scan = neural_fields.WorldField(Union(Sphere(radius=0.4), Sphere(radius=0.15, center=(0.0, 0.0, 0.75))))
+    other = neural_fields.WorldField(Sphere(radius=0.2, center=(0.7, 0.0, 0.0)))
     rng = np.random.default_rng(0)
     points = rng.normal(size=(500, 3))
     points *= 0.4 / np.linalg.norm(points, axis=1, keepdims=True)

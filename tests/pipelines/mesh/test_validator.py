@@ -47,20 +47,8 @@ def mesh():
     return replace(plain, colors=np.linspace(0, 1, 3 * len(plain.vertices), dtype=np.float32).reshape(-1, 3))
 
 
-def write_plain(path, mesh):
-    write_mesh(path, replace(mesh, normals=None, colors=None))
-
-
-def write_colored(path, mesh):
-    write_mesh(path, mesh, UTM)
-
-
-def write_placed(path, mesh):
-    write_mesh(path, mesh, UTM, PLACED)
-
-
-def write_turned(path, mesh):
-    write_mesh(path, mesh, UTM, Placement("z", "ft"))
+def plain(mesh):
+    return replace(mesh, normals=None, colors=None)
 
 
 def write_baked(path, mesh):
@@ -72,19 +60,21 @@ def write_baked(path, mesh):
 
 def write_motion(path, mesh):
     frames = [mesh.vertices + 0.1 * k for k in range(3)]
-    write_moving(
-        path,
-        mesh.faces,
-        frames,
-        [mesh.normals] * 3,
-        seconds=np.arange(3.0),
-        similarity=UTM,
-        colors=mesh.colors,
-        placement=PLACED,
-    )
+    place = {"similarity": UTM, "placement": PLACED}
+    write_moving(path, mesh.faces, frames, [mesh.normals] * 3, seconds=np.arange(3.0), colors=mesh.colors, **place)
 
 
-@pytest.mark.parametrize("write", [write_plain, write_colored, write_placed, write_turned, write_baked, write_motion])
+WRITERS = {
+    "plain": lambda path, mesh: write_mesh(path, plain(mesh)),
+    "colored": lambda path, mesh: write_mesh(path, mesh, UTM),
+    "placed": lambda path, mesh: write_mesh(path, mesh, UTM, PLACED),
+    "turned": lambda path, mesh: write_mesh(path, mesh, UTM, Placement("z", "ft")),
+    "baked": write_baked,
+    "motion": write_motion,
+}
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 def test_the_validator_finds_nothing(validate, mesh, tmp_path, write):
     path = tmp_path / "mesh.glb"
     write(path, mesh)
@@ -96,5 +86,5 @@ def test_the_validator_finds_nothing(validate, mesh, tmp_path, write):
 def test_the_validator_sees_a_damaged_file(validate, mesh, tmp_path):
     """A check of the check: an index beyond the vertices."""
     path = tmp_path / "mesh.glb"
-    write_plain(path, replace(mesh, faces=np.where(mesh.faces == 5, 10_000, mesh.faces)))
+    write_mesh(path, replace(plain(mesh), faces=np.where(mesh.faces == 5, 10_000, mesh.faces)))
     assert validate(path)["issues"]["numErrors"] > 0

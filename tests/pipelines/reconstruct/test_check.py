@@ -158,8 +158,7 @@ def test_a_region_that_cuts_the_object(good):
     assert "% of the object's pixels see past the region" in warning
 
 
-def test_masks_that_are_inverted(good, torus):
-    """All of them, and one of them."""
+def test_masks_that_are_inverted_all_or_one(good, torus):
     for images in (good, torus):
         inverted = with_masks(images, lambda mask: 1 - mask)
         assert any("they look inverted" in line for line in check_cameras(inverted).warnings)
@@ -246,7 +245,6 @@ def test_the_mesh_shows_spheres_eyes_pictures_and_points(good):
 
 
 def test_a_picture_hangs_where_its_pixels_are_seen(good):
-    """Seen from the eye, the colours of the image plane are those of the image."""
     camera = look_at((3.0, 1.0, 0.5), (0, 0, 0), up=(0, 0, 1), width=40, height=20)
     x, y = np.meshgrid(np.linspace(0, 1, 40), np.linspace(0, 1, 20))
     color = np.stack((x, y, 0.5 + 0 * x), axis=-1).astype(np.float32)

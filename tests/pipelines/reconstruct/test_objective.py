@@ -16,7 +16,7 @@ from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import SceneObjective, Schedule, scene_trainer
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import Progress, StopFlag, Trainer
-from reconstructions import QUICK, TINY_SCENE, painted_sphere, with_views, without
+from reconstructions import QUICK, TINY_SCENE, painted_sphere, weights, with_views, without
 from torch import Tensor
 
 TINY = replace(TINY_SCENE, steps=8, **QUICK)
@@ -55,10 +55,6 @@ def train(trainer: Trainer[SceneObjective], *, until: int | None = None) -> list
 
     assert trainer.run(flag, report=report, report_every=1) is (until is None)
     return seen
-
-
-def weights(trainer: Trainer[SceneObjective]) -> dict[str, Tensor]:
-    return {name: tensor.clone() for name, tensor in trainer.objective.model.state_dict().items()}
 
 
 def errors(trainer: Trainer[SceneObjective]) -> tuple[float, float]:

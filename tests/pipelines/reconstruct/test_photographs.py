@@ -77,7 +77,6 @@ def test_exposures_are_found_where_all_else_is_known() -> None:
 
 
 def test_a_view_that_was_not_trained_on_is_measured_at_its_own_exposure(images: PosedImages) -> None:
-    """The closed form finds gain and offset exactly; a background stays as it is."""
     view = images.views[0]
     white = (1 - view.mask)[..., None]
     image = ViewImage(view.mask[..., None] * view.color + white, np.zeros_like(view.color), view.mask)

@@ -16,7 +16,7 @@ from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective
 from mplicits.pipelines.training.replay import Again, CudaGraphs, Recorder, Replays, Results, Work
 from mplicits.pipelines.training.trainer import Trainer
-from reconstructions import QUICK, TINY_SCENE, painted_sphere, without
+from reconstructions import QUICK, TINY_SCENE, painted_sphere, weights, without
 from torch import Tensor
 
 TINY = replace(TINY_SCENE, steps=34, jets=400, **QUICK)
@@ -54,10 +54,6 @@ def replaying(images: PosedImages, name: str, device: torch.device) -> ReplayedT
     objective = scene(images, name, device)
     recorder = CudaGraphs() if device.type == "cuda" else Again()
     return ReplayedTrainer(objective, recorder=recorder, stage="reconstruct", steps=objective.config.steps)
-
-
-def weights(trainer: Trainer[SceneObjective]) -> dict[str, Tensor]:
-    return {name: tensor.detach().cpu().clone() for name, tensor in trainer.objective.model.state_dict().items()}
 
 
 def never(self: Replays, kind: Hashable, work: Callable[[], Mapping[str, Tensor]]) -> Mapping[str, Tensor]:

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from mplicits.neural_fields import Box, Field, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
+from mplicits.neural_fields import Box, Field, FunctionField, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
 from mplicits.pipelines.render.shade import ambient_occlusion, level_set_curvature, soft_shadow
 
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -25,11 +25,6 @@ def on_torus(count: int) -> torch.Tensor:
     return torch.stack((rho * u.cos(), rho * u.sin(), 0.2 * v.sin()), -1)
 
 
-def test_under_a_ball_it_is_dark_and_far_from_it_light():
-    lit = soft_shadow(ball_over_plane(), *on_plane((0, 0), (0.1, -0.1), (0.75, 0), (0, -0.75)), UP, softness=0.1)
-    assert lit.tolist() == [0, 0, 1, 1]
-
-
 @pytest.mark.parametrize("tilt", [0.0, 0.4, -0.6])
 def test_a_sharp_shadow_of_a_ball_is_the_ellipse_that_geometry_says(tilt):
     # Towards the lamp (sin, 0, cos): the shadow's centre is at −h tan, its half axes r / cos along x and r along y.
@@ -47,14 +42,12 @@ def test_the_penumbra_of_a_thin_plate_has_its_width_and_profile():
     edge, height, softness = 0.1, 0.5, 0.2
     plate = Box(half_size=(0.4, 2.0, 0.002), center=(edge + 0.4, 0, height))
     away = torch.tensor([-0.02, 0.005, 0.02, 0.05, 0.08, 0.12, 0.3])  # from the edge of the shadow
-    lit = soft_shadow(
-        Union(Plane(), plate), *on_plane(*((edge - d, 0.0) for d in away.tolist())), UP, softness=softness
-    )
+    places = on_plane(*((edge - d, 0.0) for d in away.tolist()))
+    lit = soft_shadow(Union(Plane(), plate), *places, UP, softness=softness)
     # The narrowest place is the one nearest to the edge: a distance d after h, give or take the way d can go along.
     u = (away / (softness * height)).clamp(0, 1)
     torch.testing.assert_close(lit, u * u * (3 - 2 * u), atol=0.03, rtol=0)
-    assert lit[0] == 0
-    assert lit[-1] == 1
+    assert (lit[0], lit[-1]) == (0, 1)
 
 
 @pytest.mark.parametrize("elevation", [0.02, 0.1, 0.5, 1.2])
@@ -84,24 +77,18 @@ def test_a_coarse_level_shadows_the_finer_surface_but_not_itself():
     assert soft_shadow(coarse, points, normals, UP, softness=0.05).tolist() == [0, 0, 1, 1]
 
 
-class Raise(Siren):
+def raised(height: float) -> Field:
     """A residual that moves the surface outward by a constant."""
-
-    def __init__(self, height: float) -> None:
-        super().__init__(4, 1)
-        self.height = height
-
-    def value(self, x: torch.Tensor, *, level: int = -1) -> torch.Tensor:
-        return torch.full_like(x[..., 0], -self.height)
+    return FunctionField(lambda x: torch.full_like(x[..., 0], -height))
 
 
 def test_rays_through_the_bands_of_a_multiscale_field_meet_the_fine_surface():
-    field = MultiscaleSDF(ball_over_plane(), [Raise(0.05)], [0.08])
+    field = MultiscaleSDF(ball_over_plane(), [raised(0.05)], [0.08])
     points = torch.tensor([[0.0, 0, 0.05], [0.225, 0, 0.05], [0.28, 0, 0.05]])  # the ball's radius is 0.25 now
     lit = soft_shadow(field, points, UP.expand_as(points), UP, softness=1e-3)
     assert lit.tolist() == [0, 0, 1]
     # A coarse ball of next to no size grows to 0.06: steps of the coarse value jump over what its rim shadows.
-    field = MultiscaleSDF(Sphere(radius=1e-3), [Raise(0.059)], [0.08])
+    field = MultiscaleSDF(Sphere(radius=1e-3), [raised(0.059)], [0.08])
     points = torch.stack((torch.full((200,), 0.058), torch.zeros(200), -torch.linspace(0.06, 0.3, 200)), -1)
     assert (soft_shadow(field, points, UP.expand_as(points), UP, softness=1e-3) == 0).all()
 
@@ -158,8 +145,7 @@ def test_curvature_of_spheres_planes_and_a_torus(dtype):
     for radius in (0.1, 0.25, 0.8):
         found = level_set_curvature(Sphere(radius=radius), radius * direction)
         torch.testing.assert_close(found, torch.full_like(found, 1 / radius), rtol=tolerance, atol=0)
-    found = level_set_curvature(Plane(normal=(1, 2, 2)), direction)
-    torch.testing.assert_close(found, torch.zeros_like(found))
+    assert level_set_curvature(Plane(normal=(1, 2, 2)), direction).abs().max() < tolerance
     points = on_torus(500)
     rho = points[:, :2].norm(dim=1)
     expected = (1 / 0.2 + (rho - 0.5) / 0.2 / rho) / 2  # of the tube, and of the circle around the axis

@@ -28,16 +28,6 @@ def drawn(image: np.ndarray) -> np.ndarray:
     return (image < 250).any(axis=2)
 
 
-def test_a_sphere_is_a_disc_of_the_right_size_without_holes():
-    seen = drawn(picture_of(sphere(), from_front(4, fov=60, size=(200, 200))))
-    # The outline of a unit sphere from distance 4 is at slope 1 / √(4² − 1); the image's edge is at slope tan 30°.
-    radius = 100 * (1 / np.sqrt(15)) / np.tan(np.radians(30))
-    assert seen.sum() == pytest.approx(np.pi * radius**2, rel=0.02)
-    rows, columns = np.mgrid[:200, :200] - 99.5
-    assert seen[np.hypot(rows, columns) < radius - 1.5].all()
-    assert not seen[np.hypot(rows, columns) > radius + 1.5].any()
-
-
 def test_pixels_see_a_tilted_square_where_their_rays_meet_it():
     normal = np.array([0.6, 0.0, 0.8])
     vertices = SQUARE @ np.array([[0.8, 0, -0.6], [0, 1, 0], [0.6, 0, 0.8]])
@@ -54,7 +44,6 @@ def test_pixels_see_a_tilted_square_where_their_rays_meet_it():
     torch.testing.assert_close(seen.position, points[seen.pixel].float(), rtol=0, atol=1e-6)
     torch.testing.assert_close(seen.direction, rays.reshape(-1, 3)[seen.pixel].float(), rtol=0, atol=1e-6)
     torch.testing.assert_close(seen.normal, torch.from_numpy(normal).float().expand_as(seen.normal))
-    assert seen.color is not None
     torch.testing.assert_close(seen.color[:, :2], (on_square[seen.pixel] / 2 + 0.5).float(), rtol=0, atol=1e-6)
 
 
@@ -76,7 +65,6 @@ def test_the_nearer_of_two_squares_hides_the_other():
         image = picture_of(Mesh(vertices, order, colors=colors), camera).astype(int)
         assert image[50, 50, 2] > image[50, 50, 0] + 100
         assert image[70, 70, 0] > image[70, 70, 2] + 100
-        assert (image[2, 2] == 255).all()
 
 
 def test_back_faces_show_as_such():
@@ -90,8 +78,7 @@ def test_back_faces_show_as_such():
 
 
 def test_cutting_triangles_keeps_their_area_in_front_and_closes_up():
-    generator = np.random.default_rng(2)
-    vertices = generator.uniform(-1, 1, (90, 3))
+    vertices = np.random.default_rng(2).uniform(-1, 1, (90, 3))
     faces = np.arange(90).reshape(30, 3)
     height = vertices[:, 2] - 0.1
     cut = clip(height, faces)
@@ -149,14 +136,6 @@ def test_a_view_from_inside_a_closed_mesh_sees_it_everywhere():
     assert float((seen.normal * seen.direction).sum(dim=1).min()) > 0  # outward, so away from the eye
 
 
-def test_a_cloud_is_discs_of_the_size_asked_for():
-    point = Mesh(np.array([[0.0, 0, 0]]), NO_FACES, colors=np.array([[0.0, 0, 0]]))
-    image = picture_of(point, from_front(4, fov=40, size=(65, 65)), point_size=11)
-    ink = (255 - image[..., 0].astype(float)).sum() / 255
-    assert ink == pytest.approx(np.pi * 5.5**2, rel=0.1)
-    assert not drawn(image)[:20].any()
-
-
 def test_the_pixels_of_a_disc_see_its_point():
     points = np.array([[0.5, 0.25, 0.0], [0.5, 0.25, 1.0], [-0.5, 0, 0]])
     normals = np.array([[0.0, 0, 1], [0, 1, 0], [0, 0, 0]])
@@ -167,7 +146,6 @@ def test_the_pixels_of_a_disc_see_its_point():
     x, y = (pixels[:, k].round().long() for k in (0, 1))
     rows = dict(zip(seen.pixel.tolist(), range(len(seen.pixel)), strict=True))
     assert len(rows) == 27  # three discs apart from each other: i² + j² ≤ 1.5² holds for 9 pixels
-    assert seen.color is not None
     for index in range(3):
         row = rows[int(y[index] * 81 + x[index])]
         torch.testing.assert_close(seen.position[row], torch.from_numpy(points[index]).float())
@@ -181,16 +159,6 @@ def test_the_pixels_of_a_disc_see_its_point():
     torch.testing.assert_close(without.normal, -without.direction)
 
 
-def test_a_dense_cloud_looks_like_its_surface():
-    ball = sphere()
-    cloud = Mesh(ball.vertices, NO_FACES, ball.vertices)
-    camera = orbit(ball.vertices, width=96, height=96)
-    mesh, points = (picture_of(shape, camera).astype(float) for shape in (ball, cloud))
-    both = drawn(mesh) & drawn(points)
-    assert both.sum() > 0.95 * drawn(mesh).sum()
-    assert np.median(abs(mesh - points)[both]) < 8
-
-
 def test_a_cloud_without_normals_is_darker_where_it_is_further():
     points = np.array([[-1.0, 0, 1], [1.0, 0, -1]])
     image = picture_of(Mesh(points, NO_FACES), from_front(6, fov=40, size=(100, 100)), point_size=8)
@@ -200,10 +168,6 @@ def test_a_cloud_without_normals_is_darker_where_it_is_further():
 
 def test_pictures_of_the_same_thing_far_from_the_origin_are_the_same():
     ball, home = sphere(), np.array([5e5, 5.4e6, 300])
-    camera = orbit(ball.vertices, width=48, height=48)
-    far = Mesh(ball.vertices + home, ball.faces)
-    np.testing.assert_allclose(
-        picture_of(far, orbit(far.vertices, width=48, height=48)).astype(int),
-        picture_of(ball, camera).astype(int),
-        atol=1,
-    )
+    shapes = (ball, Mesh(ball.vertices + home, ball.faces))
+    here, there = (picture_of(shape, orbit(shape.vertices, width=48, height=48)).astype(int) for shape in shapes)
+    np.testing.assert_allclose(there, here, atol=1)

@@ -9,14 +9,14 @@ WORDS = "|f₁| < δ₁ = 0.5"
 
 
 @pytest.fixture(params=["as installed", "without fonts"])
-def any_opencv(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def any_opencv(request, monkeypatch) -> None:
     if request.param == "without fonts":
         monkeypatch.delattr(cv2, "FontFace", raising=False)
 
 
 @pytest.mark.usefixtures("any_opencv")
 @pytest.mark.parametrize("size", [9, 20, 64])
-def test_words_are_where_their_place_and_width_say(size: int) -> None:
+def test_words_are_where_their_place_and_width_say(size: int):
     left, width = 2 * size, text_width(WORDS, size)
     mask = text_mask((4 * size, width + 4 * size), WORDS, (left, 2 * size), size)
     assert mask.max() > 0.5
@@ -29,7 +29,7 @@ def test_words_are_where_their_place_and_width_say(size: int) -> None:
     assert rows.max() - 2 * size <= 3 * size / 4
 
 
-def test_letters_that_strokes_do_not_have_get_names() -> None:
+def test_letters_that_strokes_do_not_have_get_names():
     assert plain("δ₁ = −2.5 mm⁻¹, 90°") == "delta1 = -2.5 mm-1, 90 deg"
     assert plain("f₀ = 0") == "f0 = 0"
     assert plain("面 1") == " 1"

@@ -29,14 +29,14 @@ CUBOID = Mesh(
         ((-1.0, 0.25, 0.0), (0.75, 0, 0.25)),
     ],
 )
-def test_nearest_point_of_a_triangle(point: tuple[float, ...], expected: tuple[float, ...]) -> None:
+def test_nearest_point_of_a_triangle(point: tuple[float, ...], expected: tuple[float, ...]):
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     weights = barycentric_of_nearest(np.array(point), corners)
     np.testing.assert_allclose(weights, expected, atol=1e-15)
     assert [w == 0 for w in weights] == [e == 0 for e in expected]
 
 
-def test_distances_to_a_box_are_exact_inside_outside_and_over_its_edges() -> None:
+def test_distances_to_a_box_are_exact_inside_outside_and_over_its_edges():
     points = np.random.default_rng(0).uniform(-1, 1, (3000, 3))
     q = np.abs(points) - HALF
     exact = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
@@ -44,7 +44,7 @@ def test_distances_to_a_box_are_exact_inside_outside_and_over_its_edges() -> Non
 
 
 @pytest.mark.slow
-def test_long_faces_beside_many_small_ones_hide_nobody() -> None:
+def test_long_faces_beside_many_small_ones_hide_nobody():
     # A large triangle far below a finely triangulated patch: its centre is much further away than it is.
     grid = np.linspace(-0.05, 0.05, 30)
     x, y = np.meshgrid(grid, grid, indexing="ij")
@@ -57,7 +57,7 @@ def test_long_faces_beside_many_small_ones_hide_nobody() -> None:
     np.testing.assert_allclose(MeshDistance(both).signed(points), [0.03, 0.06, -0.06, 0.05], atol=1e-14)
 
 
-def test_sign_at_a_sharp_tip_is_that_of_all_faces_around_it() -> None:
+def test_sign_at_a_sharp_tip_is_that_of_all_faces_around_it():
     # Past the tip of a flat needle two of its faces, taken alone, would say inside.
     tip = Mesh(
         np.array([[1.0, 0, 0], [0, 0.2, 0], [0, -0.1, 0.17], [0, -0.1, -0.17]]),
@@ -69,6 +69,6 @@ def test_sign_at_a_sharp_tip_is_that_of_all_faces_around_it() -> None:
     assert MeshDistance(tip).signed(np.array([[0.5, 0.0, 0.0]]))[0] < 0
 
 
-def test_a_surface_without_faces_has_no_distances() -> None:
+def test_a_surface_without_faces_has_no_distances():
     with pytest.raises(ValueError, match="no faces"):
         MeshDistance(Mesh(np.eye(3), np.array([[0, 0, 1]])))

@@ -2,23 +2,14 @@ import numpy as np
 import pytest
 from mplicits.neural_fields import InputError, Sphere, Union
 from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
-from mplicits.pipelines.surface.surface import (
-    drop_unsupported,
-    face_normals,
-    in_region,
-    keep_faces,
-    keep_largest,
-    support_radius,
-    trim_distance,
-    without_voids,
-)
+from mplicits.pipelines.surface import surface
+from mplicits.pipelines.surface.surface import drop_unsupported, face_normals, keep_faces, keep_largest, trim_distance
 
 
 @pytest.fixture(scope="module")
 def two():
-    return extract_mesh(
-        Union(Sphere(radius=0.15, center=(-0.6, 0, 0)), Sphere(radius=0.4, center=(0.3, 0, 0))), resolution=40
-    )
+    small, large = Sphere(radius=0.15, center=(-0.6, 0, 0)), Sphere(radius=0.4, center=(0.3, 0, 0))
+    return extract_mesh(Union(small, large), resolution=40)
 
 
 def test_keep_largest_keeps_the_larger_sphere_whole(two):
@@ -65,21 +56,20 @@ def test_voids_are_dropped_and_what_is_solid_or_open_stays(two):
     void = extract_mesh(Sphere(radius=0.2, center=(0.3, 0, 0)), resolution=40)
     count = len(two.vertices)
     both = Mesh(np.concatenate((two.vertices, void.vertices)), np.concatenate((two.faces, void.faces[:, ::-1] + count)))
-    solid = without_voids(both)
+    solid = surface.without_voids(both)
     assert len(solid.faces) == len(two.faces)
     assert np.array_equal(solid.vertices, two.vertices)
     opened = keep_faces(both, np.arange(len(both.faces)) > len(two.faces))  # the void's wall with one face missing
-    assert len(without_voids(opened).faces) == len(void.faces) - 1
+    assert len(surface.without_voids(opened).faces) == len(void.faces) - 1
 
 
 def test_the_region_is_the_unit_sphere():
     corner = Sphere(radius=0.2, center=(0.8, 0.8, 0.8))
     mesh = extract_mesh(Union(Sphere(radius=0.5), corner), resolution=32)
-    kept = in_region(mesh)
-    assert kept is not None
+    kept = surface.in_region(mesh)
     assert len(kept.faces) < len(mesh.faces)
     assert np.linalg.norm(kept.vertices, axis=1).max() < 0.6
-    assert in_region(extract_mesh(corner, resolution=32)) is None
+    assert surface.in_region(extract_mesh(corner, resolution=32)) is None
 
 
 def on_sphere(count, radius, center):
@@ -123,5 +113,5 @@ def test_points_that_belong_elsewhere_remove_nothing(two):
 
 def test_support_radius_holds_spacing_and_error():
     grid = np.stack(np.meshgrid(*[np.arange(10.0)] * 2, [0.0]), axis=-1).reshape(-1, 3)
-    assert support_radius(grid) == pytest.approx(3.0)
-    assert support_radius(grid, error=2.0) == pytest.approx(3 * np.hypot(1.0, 2.0))
+    assert surface.support_radius(grid) == pytest.approx(3.0)
+    assert surface.support_radius(grid, error=2.0) == pytest.approx(3 * np.hypot(1.0, 2.0))

@@ -24,11 +24,7 @@ def test_near_samples_their_colours():
 
 
 def test_no_jump_between_two_sides():
-    """Half-way between a black and a white plane the nearest point jumps; r away, colours change by 3.5 / r at most.
-
-    Between cells of width c, of colours from 0 to 1, the slope is at most 1 / c, and c is at least r / 2; along log₂ r
-    it is at most 1, with a slope of 1 / (r ln 2).
-    """
+    """Half-way between a black and a white plane the nearest point jumps; r away, colours change by 3.5 / r at most."""
     sheet = torch.cartesian_prod(torch.linspace(-1, 1, 240), torch.linspace(-1, 1, 240))  # in every cell
     planes = [torch.cat((sheet, torch.full((len(sheet), 1), z)), dim=1) for z in (-0.4, 0.4)]
     white = torch.cat([torch.full((len(sheet), 1), float(side)) for side in (0, 1)])
@@ -37,6 +33,7 @@ def test_no_jump_between_two_sides():
     points = torch.stack((torch.full_like(across, 0.13), torch.full_like(across, -0.21), across), dim=1)
     reach = 0.4 - across.abs()
     found = spread(points, reach)[:, 0]
+    # Between cells of width c ≥ r / 2 the slope is at most 1 / c; along log₂ r it is at most 1 / (r ln 2).
     assert (found.diff().abs() <= (2 + 1 / math.log(2)) / reach[1:].minimum(reach[:-1]) * across.diff() + 1e-5).all()
     torch.testing.assert_close(found + found.flip(0), torch.ones_like(found))  # the lattice is symmetric
     depth = (math.floor(0.4 / CELL) + 0.5) * CELL  # in cells with a plane in them

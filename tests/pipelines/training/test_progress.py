@@ -69,8 +69,7 @@ def test_a_counter_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> Non
     assert capsys.readouterr().err.splitlines() == ["scan: 50%; about 40 s left"]
 
 
-def test_no_torch() -> None:
-    """A bar may be shown before anything heavy is loaded."""
+def test_a_bar_can_be_shown_before_torch_is_loaded() -> None:
     code = "import sys, mplicits.pipelines.training.progress; assert not {'torch', 'numpy'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 

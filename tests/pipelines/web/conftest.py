@@ -5,7 +5,9 @@ from browser import start_browser
 from mplicits.neural_fields import Similarity, save_field
 from mplicits.neural_fields.checkpoint import save_texture
 from mplicits.pipelines.cli import main
-from pages import TITLE, bumpy, painted, until
+from pages import TITLE, bumpy, open_page, painted
+
+OPENED = {"WebGL 2": "?pixel=16&webgl", "WebGPU": "?pixel=16"}
 
 
 @pytest.fixture(scope="session")
@@ -28,29 +30,16 @@ def browser(tmp_path_factory):
     driver.quit()
 
 
-@pytest.fixture
-def opened(browser, page):
-    """The page, with rays of 16 pixels at rest: software is slow."""
-    browser.get_log("browser")  # what pages before this one said is not its own
-    address = f"{page.as_uri()}?pixel=16&webgl"
-    if browser.current_url != address:
-        browser.get(address)
-        until(lambda: browser.execute_script("return !!window.mplicits"))
-    return browser
-
-
 @pytest.fixture(scope="module")
 def kind(request):
-    return request.param
+    """Either of the two that trace: "WebGL 2", or "WebGPU" where a test says so."""
+    return getattr(request, "param", "WebGL 2")
 
 
 @pytest.fixture
-def drawn(browser, page, kind):
-    """The page, with either of the two that trace: "WebGL 2" or "WebGPU"."""
-    browser.get_log("browser")  # what pages before this one said is not its own
-    address = f"{page.as_uri()}?pixel=16{'&webgl' if kind == 'WebGL 2' else ''}"
-    if browser.current_url != address:
-        browser.get(address)
-        until(lambda: browser.execute_script("return window.mplicits?.renderer?.kind"))
-    assert browser.execute_script("return window.mplicits.renderer.kind") == kind
+def opened(browser, page, kind):
+    """The page, which is loaded again only for another kind."""
+    browser.get_log("browser")  # messages of pages before this one
+    if browser.current_url != page.as_uri() + OPENED[kind]:
+        open_page(browser, page.as_uri(), kind=kind)
     return browser

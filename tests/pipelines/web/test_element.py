@@ -5,12 +5,12 @@ import http.server
 import json
 import re
 import struct
-import threading
 import zlib
 from pathlib import Path
 
 import pytest
 import torch
+from browser import served
 from mplicits.neural_fields import Similarity, save_field
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.export import BITS
@@ -49,16 +49,8 @@ def site(folder):
             self.end_headers()
             self.wfile.write(body)
 
-        def log_message(self, *_):
-            pass
-
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(folder)))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}"
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with served(functools.partial(Handler, directory=str(folder))) as address:
+        yield address
 
 
 def test_what_is_in_the_folder(folder):
@@ -85,18 +77,17 @@ def test_a_field_in_another_page(browser, site):
     browser.get(f"{site}/host-field.bin.html")
     find = "return document.querySelector('mplicits-field')"
     until(lambda: browser.execute_script(f"{find}.dataset.drawn"))
-    assert browser.execute_script(f"{find}.page.level") == 1
     assert browser.title == "host"  # nothing of the other page is touched
-    assert browser.execute_script("return document.getElementById('title').textContent") == "Mine"
+    assert browser.find_element("id", "title").text == "Mine"
+    assert browser.execute_script(f"{find}.page.level") == 1
     assert browser.execute_script(f"{find}.page.orbit.azimuth") == 90
     point = [0.3, 0.2, -0.4]
     script = f"{find}.renderer.values(Float32Array.from(arguments[0]), 0).then((f) => Array.from(f))"
     expected = rounded_field(bumpy(), BITS).value(torch.tensor([point]), level=0).item()
     assert browser.execute_script(script, point) == pytest.approx([expected], abs=1e-4)
-    style = (
-        "return getComputedStyle(document.querySelector('mplicits-field').shadowRoot.getElementById('panel')).position"
-    )
-    assert browser.execute_script(style) == "absolute"  # its styles are there in spite of the policy
+    panel = "document.querySelector('mplicits-field').shadowRoot.getElementById('panel')"
+    style = browser.execute_script(f"return getComputedStyle({panel}).position")
+    assert style == "absolute"  # its styles are there in spite of the policy
     refused = [entry["message"] for entry in browser.get_log("browser") if "Content Security" in entry["message"]]
     assert not refused
     # Taken out and put back, it begins anew.

@@ -2,35 +2,29 @@
 
 import base64
 import hashlib
-import json
 import re
 import zlib
 
 import numpy as np
 import pytest
-import torch
-from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, save_field
-from mplicits.neural_fields.networks.multiscale import solve_sphere
+from evolutions import fails
+from mplicits.neural_fields import Similarity, save_field
 from mplicits.neural_fields.spacetime.field import SpaceTimeSDF
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.export import BITS
 from mplicits.pipelines.web.payload import text_of
+from pages import bumpy, written_header
 
 NASTY = '</script><img src=x onerror="document.title=1">@DATA@'
 
 
-def ball(levels=2):
-    torch.manual_seed(0)
-    base = Siren(32, 2, omega=6.0)
-    solve_sphere(base, 0.6)
-    residuals = [Siren(16, 2, omega=8.0, output_gain=0.1) for _ in range(levels - 1)]
-    return MultiscaleSDF(base, residuals, [0.1] * (levels - 1), taper=0.2)
+BALL = bumpy()
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     file = tmp_path_factory.mktemp("run") / "ball.safetensors"
-    save_field(file, ball(), similarity=Similarity((1e6, 2.0, 3.0), 40.0), metadata={"secret": "a name of the user"})
+    save_field(file, BALL, similarity=Similarity((1e6, 2.0, 3.0), 40.0), metadata={"secret": "a name of the user"})
     return file
 
 
@@ -61,24 +55,15 @@ def test_bytes_come_back_from_letters():
     assert bytes_of(text_of(b"\xff" * 100)) == b"\xff" * 100
 
 
-def parts(page):
-    """Header, bytes, scripts and styles of a page, as a browser would find them."""
-    text = page.read_text(encoding="utf-8")
-    header = json.loads(re.search(r'id="header">(.*?)</script>', text)[1])
-    data = zlib.decompress(bytes_of(re.search(r'id="data">(.*?)</script>', text)[1]), -zlib.MAX_WBITS)
-    return text, header, data
-
-
 def test_a_page_is_whole_and_lets_nothing_else_in(run, tmp_path, capsys):
     out = tmp_path / "page.html"
     assert web(run, "-o", out) == 0
-    said = capsys.readouterr().out
-    assert f"weights of {BITS} bits: distances change by at most" in said
-    assert "2 levels" in said
-    text, header, data = parts(out)
+    assert f"weights of {BITS} bits: distances change by at most" in capsys.readouterr().out
+    text, header = out.read_text(encoding="utf-8"), written_header(out)
+    data = zlib.decompress(bytes_of(re.search(r'id="data">(.*?)</script>', text)[1]), -zlib.MAX_WBITS)
     assert header["bytes"] == len(data)
     assert header["crc32"] == zlib.crc32(data)
-    assert [part["width"] for part in header["levels"]] == [32, 16]
+    assert [part["width"] for part in header["levels"]] == [32, 18, 16]
     assert header["title"] == "ball"
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
     assert policy.startswith("default-src 'none'; ")
@@ -97,9 +82,8 @@ def test_a_page_is_whole_and_lets_nothing_else_in(run, tmp_path, capsys):
 def test_the_title_is_text_whatever_it_is(run, tmp_path):
     out = tmp_path / "page.html"
     assert web(run, "-o", out, "--title", NASTY) == 0
-    text, header, _ = parts(out)
-    assert header["title"] == NASTY
-    assert "<img" not in text
+    assert written_header(out)["title"] == NASTY
+    assert "<img" not in out.read_text(encoding="utf-8")
 
 
 def test_exact_weights_and_fewer_levels(run, tmp_path, capsys):
@@ -107,40 +91,35 @@ def test_exact_weights_and_fewer_levels(run, tmp_path, capsys):
     for name, flags in {"all": [], "one": ["--levels", "1"], "exact": ["--float32"]}.items():
         out = tmp_path / f"{name}.html"
         assert web(run, "-o", out, *flags) == 0
-        sizes[name], header = out.stat().st_size, parts(out)[1]
-        assert len(header["levels"]) == (1 if name == "one" else 2)
+        sizes[name], header = out.stat().st_size, written_header(out)
+        assert len(header["levels"]) == (1 if name == "one" else 3)
         assert header["bits"] == (None if name == "exact" else BITS)
     assert sizes["one"] < sizes["all"] < sizes["exact"]
     assert "weights of" not in capsys.readouterr().out.splitlines()[-1]
 
 
 def test_a_moment_of_a_field_that_moves(tmp_path):
-    moving = SpaceTimeSDF.from_static(ball())
-    file = tmp_path / "moving.safetensors"
-    save_field(file, moving)
-    assert web(file, "-o", tmp_path / "page.html", "--time", 0.5) == 0
-    assert [part["width"] for part in parts(tmp_path / "page.html")[1]["levels"]] == [32, 16]
+    file, page = tmp_path / "moving.safetensors", tmp_path / "page.html"
+    save_field(file, SpaceTimeSDF.from_static(BALL))
+    assert web(file, "-o", page, "--time", 0.5) == 0
+    assert [part["width"] for part in written_header(page)["levels"]] == [32, 18, 16]
 
 
 def test_mistakes_are_one_line(run, tmp_path, capsys):
     foreign = tmp_path / "letter.html"
     foreign.write_text("<p>mine")
     moving = tmp_path / "moving.safetensors"
-    save_field(moving, SpaceTimeSDF.from_static(ball()))
+    save_field(moving, SpaceTimeSDF.from_static(BALL))
     out = tmp_path / "page.html"
-    mistakes = {
-        (run, "-o", tmp_path / "page.png"): "unknown extension",
-        (run, "-o", foreign): "no page of this command",
-        (tmp_path / "none", "-o", out): "no such file",
-        (moving, "-o", out, "--cloud", foreign): "--cloud",
-        (run, "-o", out, "--levels", 3): "has levels 0 to 1",
-        (run, "-o", out, "--time", 0.5): "does not move",
-    }
-    for words, expected in mistakes.items():
-        assert web(*words) == 2
-        said = capsys.readouterr().err.strip()
-        assert expected in said
-        assert "\n" not in said
+    for words, expected in (
+        (f"{run} -o {tmp_path}/page.png", "unknown extension"),
+        (f"{run} -o {foreign}", "no page of this command"),
+        (f"{tmp_path}/none -o {out}", "no such file"),
+        (f"{moving} -o {out} --cloud {foreign}", "--cloud"),
+        (f"{run} -o {out} --levels 4", "has levels 0 to 2"),
+        (f"{run} -o {out} --time 0.5", "does not move"),
+    ):
+        assert expected in fails(capsys, f"web {words}")
     assert not out.exists()
     assert foreign.read_text() == "<p>mine"
     assert web(run, "-o", foreign, "--force") == 0

@@ -1,14 +1,13 @@
 """Numbers for the shaders: turns, rounding and packing, against exact arithmetic."""
 
 import math
-import zlib
 
 import numpy as np
 import pytest
 import torch
 from fields import small_multiscale
 from mplicits.neural_fields import Siren
-from mplicits.pipelines.web.payload import Payload, network_layers, pack_codes, rounded_field, rounding_error
+from mplicits.pipelines.web.payload import network_layers, pack_codes, rounded_field, rounding_error
 
 
 def evaluate(layers, points):
@@ -36,8 +35,6 @@ def test_rounded_weights_are_within_half_a_step_of_their_row():
     torch.manual_seed(1)
     network = Siren(16, 2, omega=30.0)
     exact, rounded = network_layers(network, None), network_layers(network, 16)
-    assert rounded[0].codes is None
-    assert rounded[2].codes is None
     codes, scale = rounded[1].codes, rounded[1].scale
     assert np.abs(codes).max() == 2**15 - 1
     step = np.abs(exact[1].weight).max(axis=1) / (2**15 - 1)
@@ -57,9 +54,8 @@ def test_the_error_that_is_stated_is_that_of_the_rounded_field():
         assert part.value == pytest.approx(float(change), rel=1e-4)
         assert part.value > 0
         assert part.angle > 0
-    assert all(
-        after.value < before.value for before, after in zip(rough, rounding_error(field, 12, points), strict=True)
-    )
+    fine = rounding_error(field, 12, points)
+    assert all(after.value < before.value for before, after in zip(rough, fine, strict=True))
 
 
 @pytest.mark.parametrize("bits", [2, 5, 8, 13, 16, 24])
@@ -73,25 +69,3 @@ def test_packed_codes_come_back(bits):
     number = int.from_bytes(data[101:], "little")
     found = [(upper << low) + ((number >> (low * i)) & (2**low - 1)) for i, upper in enumerate(data[:101])]
     assert [code - 2**bits if code >> (bits - 1) else code for code in found] == codes.tolist()
-
-
-def test_blocks_begin_at_multiples_of_four():
-    payload = Payload()
-    payload.add("a", np.arange(3), "u2")
-    payload.add("b", np.array([1.5]), "f4")
-    data, described = payload.content()
-    assert described["blocks"] == {"a": ["u2", 3, 0], "b": ["f4", 1, 8]}
-    data = zlib.decompress(data, -zlib.MAX_WBITS)
-    assert described["bytes"] == len(data) == 12
-    assert np.frombuffer(data, "<f4", 1, 8)[0] == 1.5
-
-
-def test_steps_come_back():
-    payload = Payload()
-    numbers = np.random.default_rng(0).integers(0, 1000, 50)
-    payload.add_steps("a", numbers)
-    kind, count, first = payload.blocks["a"]
-    assert (count, first) == (50, 0)
-    steps = np.diff(numbers, prepend=0)
-    assert payload.parts[0].startswith(pack_codes(steps, int(kind[1:])))
-    assert kind == f"d{int(np.abs(steps).max()).bit_length() + 1}"

@@ -4,7 +4,6 @@ import sys
 import types
 import urllib.request
 import webbrowser
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ from mplicits.pipelines.web.window import in_notebook, until_closed
 BALL = WorldField(Sphere(radius=0.5), Similarity((10.0, 0.0, 0.0), 4.0))
 
 
-def test_a_shape_in_memory_is_drawn_as_its_file_is(tmp_path: Path) -> None:
+def test_a_shape_in_memory_is_drawn_as_its_file_is(tmp_path):
     save_field(tmp_path / "ball.safetensors", BALL.field, similarity=BALL.similarity)
     render_run(tmp_path / "ball.safetensors", tmp_path / "file.png", RenderOptions(size=(40, 30)))
     picture = BALL.render(tmp_path / "shape.png", size=(40, 30))
@@ -29,7 +28,7 @@ def test_a_shape_in_memory_is_drawn_as_its_file_is(tmp_path: Path) -> None:
     assert not np.array_equal(BALL.render(size=(40, 30), azimuth=200.0), picture)
 
 
-def test_nothing_to_draw_is_said_in_one_line(tmp_path: Path) -> None:
+def test_nothing_to_draw_is_said_in_one_line(tmp_path):
     with pytest.raises(InputError, match="no surface to render"):
         WorldField(lambda x: x.norm(dim=-1) + 1).render()
     with pytest.raises(InputError, match="xyz"):
@@ -38,7 +37,7 @@ def test_nothing_to_draw_is_said_in_one_line(tmp_path: Path) -> None:
         BALL.render(level=1)
 
 
-def test_a_script_waits_until_the_page_is_closed() -> None:
+def test_a_script_waits_until_the_page_is_closed():
     visits = iter([0, 0, 1, 2, 1, 0, 1, 0, 0])
     until_closed(lambda: next(visits, 0), look=0.0, gone=0.0)
     assert list(visits) in ([1, 2, 1, 0, 1, 0, 0], [2, 1, 0, 1, 0, 0])  # someone has come; no patience was asked for
@@ -49,7 +48,7 @@ def test_a_script_waits_until_the_page_is_closed() -> None:
     until_closed(interrupted)  # no traceback
 
 
-def test_the_page_of_a_script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_page_of_a_script(monkeypatch, capsys):
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
     with BALL.show(block=False) as viewer:
@@ -61,7 +60,7 @@ def test_the_page_of_a_script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert opened[1:] == ["0"]
 
 
-def test_a_notebook_gets_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_gets_a_page(monkeypatch):
     assert not in_notebook()
     notebook = types.ModuleType("IPython")
     notebook.get_ipython = lambda: types.SimpleNamespace(config={"IPKernelApp": {}})

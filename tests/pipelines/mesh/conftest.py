@@ -1,0 +1,21 @@
+"""Colours and normals of surface points, to be baked and found again."""
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="session")
+def painting():
+    """Colours that change smoothly with position; no two channels alike, and dark ones among them."""
+    return lambda points: 0.5 + 0.45 * np.sin(points * (3, 4, 5) + (0, 1, 2))
+
+
+@pytest.fixture(scope="session")
+def bumpy():
+    """Normals of the sphere, tilted by up to a third."""
+
+    def normals(points):
+        tilted = points / np.linalg.norm(points, axis=1, keepdims=True) + 0.3 * np.sin(5 * points[:, [1, 2, 0]])
+        return tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
+
+    return normals
