@@ -285,7 +285,7 @@ def _packed(state: Mapping[str, Tensor], kind: _Kind, header: Mapping[str, Any])
     # Cloned: a field that is part of a combination twice has its tensors twice, which safetensors refuses.
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in state.items()}
     described = {"format": kind.key, "version": FILE_VERSION, **header, "checksum": checksum_of(tensors)}
-    # Bytes, not save_file: that makes files nobody else may read, whatever the umask.
+    # Bytes, not save_file: that ignores the umask, so that other users cannot read the file.
     return save(tensors, metadata={kind.key: json.dumps(described)})
 
 

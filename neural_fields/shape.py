@@ -105,7 +105,7 @@ class WorldField:
         Args:
             points: in input coordinates.
             level: see `distance`.
-            steps: at most so many evaluations for a point.
+            steps: largest number of evaluations for a point.
             tolerance: on the distance, in units of the field.
         """
 

@@ -144,7 +144,7 @@ def _survey(stream: CloudStream) -> _Survey:
 
 
 def _first_size(frame: _Survey, limit: int) -> float:
-    """The edge of voxels of which a surface meets about half of ``limit``; their number goes as one over it squared."""
+    """The edge of voxels, if a surface meets about half of ``limit``; their number goes as one over it squared."""
     size, found = frame.extent, 1
     # With 20 points of the sample per cell, nearly all cells of the surface are found.
     while found * 20 < len(frame.sample) and size > frame.extent / 2**MERGE.bits:

@@ -40,7 +40,7 @@ class Statue(OneLevelField):
 
     def _evaluate(self, x: Tensor) -> Solid:
         rows = x.reshape(-1, 3)
-        # The temporaries of so many rows stay in cache.
+        # The temporaries of a block of this size stay in cache.
         blocks = [_statue(block) for block in rows.split(16384)] if len(rows) else [Solid(rows[:, 0], rows)]
         return Solid(torch.cat([b.value for b in blocks]), torch.cat([b.gradient for b in blocks]))
 

@@ -26,7 +26,7 @@ from .region import region_from_cameras, region_from_masks, region_from_points
 
 OBJECT = 0.5  # a pixel of a mask with a larger share of object counts as object
 FILES = ("cameras_sphere.npz", "transforms.json", "transforms_train.json")  # looked for in a folder, in this order
-OPAQUE = 0.999  # what is left of 1 after resampling
+OPAQUE = 0.999  # an opacity of 1 after resampling
 EXACT = 0.01  # pixels that distorting an undistorted point may miss it by
 
 Float32 = NDArray[np.float32]
@@ -320,7 +320,7 @@ def shrink(image: Float32, width: int, height: int) -> Float32:
 
 
 def undistorted_camera(camera: Camera) -> Camera:
-    """The pinhole at the same place, with as many pixels, all of which the distorted image covers.
+    """The pinhole at the same place, with as many pixels, every one covered by the distorted image.
 
     Its image is the largest rectangle, in the plane at depth 1, with none of the distorted image's border inside it. A
     ValueError is raised if the distortion folds the image over.

@@ -24,7 +24,7 @@ class RegionOptions:
     clear: float = 0.9  # largest radius, as a share of the distance to the nearest camera
     margin: float = 1.05  # radius over that of what the sphere encloses
     cells: int = 64  # of the grid of the visual hull, along each side
-    one_in: int = 20  # one view in so many may miss a part of the hull
+    one_in: int = 20  # views for each one that may miss a part of the hull
     few: int = 4  # views from which one may miss a part, if the hull is empty otherwise
     fewest: int = 8  # points, of the cloud or of the grid
     tail: float = 0.02  # share of the sparse points that is ignored on either side
@@ -128,7 +128,7 @@ def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.floa
 def _hull(
     low: Float64, high: Float64, cameras: Sequence[Camera], solid: Sequence[NDArray[np.bool_]], may_differ: int
 ) -> tuple[Float64, Float64]:
-    """Points of the grid between two corners, object but in so many views ``(N, 3)``, and its steps ``(3,)``."""
+    """Points of the grid between two corners, object in all views but a few ``(N, 3)``, and its steps ``(3,)``."""
     lines = [np.linspace(low[axis], high[axis], REGION.cells) for axis in range(3)]
     points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
     views, against = np.zeros((2, len(points)), np.int64)

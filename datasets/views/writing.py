@@ -28,7 +28,7 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 PINHOLE = 1  # COLMAP's number for the model with fx, fy, cx, cy
-GREY = 128  # the colour of sparse points, of which only the place is known
+GREY = 128  # the colour of sparse points, whose own colour is unknown
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's axes (y up, z backward) to OpenCV's, and back
 
 

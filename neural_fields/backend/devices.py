@@ -15,12 +15,14 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
 
 from .errors import InputError
+
+M = TypeVar("M", bound=Callable[..., Any])
 
 
 def makes_wait(device: torch.device) -> bool:
@@ -132,11 +134,24 @@ def precise(device: torch.device) -> torch.dtype:
     return torch.float32 if device.type == "mps" else torch.float64
 
 
-def is_traced() -> bool:
-    """Whether plain operations are needed: under `torch.func.vmap`, or while `torch.compile` traces.
+def uncompiled(method: M) -> M:
+    """A method that compiled code calls unchanged, with the same bits and the same kernels as elsewhere.
 
-    Inductor turns writes into parts of uninitialised buffers into wrong numbers.
+    `torch.compile` cannot improve on what is written out by hand, and Inductor turns writes into parts of
+    uninitialised buffers into wrong numbers. The decorator is made when it is first needed, as it imports the compiler.
     """
+
+    @functools.wraps(method)
+    def call(*args: Any, **options: Any) -> Any:
+        if torch.compiler.is_dynamo_compiling():
+            return torch.compiler.disable(method)(*args, **options)
+        return method(*args, **options)
+
+    return cast(M, call)
+
+
+def is_traced() -> bool:
+    """Whether plain operations are needed: under `torch.func.vmap`, or while `torch.export` traces."""
     return torch.compiler.is_compiling() or under_vmap()
 
 

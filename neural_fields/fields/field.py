@@ -11,6 +11,8 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..backend.devices import uncompiled
+
 
 class Jet(NamedTuple):
     """Value, gradient and features of a field at some points (its 1-jet).
@@ -112,6 +114,7 @@ class Field(nn.Module, ABC):
             shown["deltas"] = [float(f"{delta:.6g}") for delta in self.deltas.tolist()]
         return ", ".join(f"{name}={value!r}" for name, value in shown.items())
 
+    @uncompiled
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
         """Evaluate value, gradient and Hessian at ``x`` ``(..., d)``.
 
@@ -329,6 +332,7 @@ class FunctionField(Field):
             raise ValueError(f"function: returned {got} for points {tuple(x.shape)}; expected {tuple(x.shape[:-1])}")
         return found
 
+    @uncompiled
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; one pass forward and one back."""
         recorded = torch.is_grad_enabled() and (x.requires_grad or any(p.requires_grad for p in self.parameters()))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from ..backend.devices import under_vmap
+from ..backend.devices import uncompiled, under_vmap
 from ..backend.errors import positive
 from ..backend.fixed_shapes import FixedShapes, Rows, current_shapes
 from ..backend.kernels.switch import Choice, choose
@@ -132,6 +132,7 @@ class MultiscaleSDF(Field):
         """The base, and the residuals after it, coarse to fine."""
         return (self.base, *self.residuals)  # pyright: ignore[reportReturnType]
 
+    @uncompiled
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; outside the band of level j − 1, level j is level j − 1."""
         self.check_points(x)
@@ -143,6 +144,7 @@ class MultiscaleSDF(Field):
         (f,) = deque(self._walk(x, level, _value), maxlen=1).pop()
         return f
 
+    @uncompiled
     def value_features(self, x: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
         """See `Field.value_features`; without gradients at any level."""
         walk = self._walk(x, level, lambda part, points: part.value_features(points))
@@ -153,6 +155,7 @@ class MultiscaleSDF(Field):
         """See `Field.level_values`; every level is evaluated once, and only inside the bands before it."""
         return [f for (f,) in self._walk(x, level, _value)]
 
+    @uncompiled
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; inside a tapered band ∇(γr) = γ∇r + r γ′ ∇f."""
         self.check_points(x)
@@ -164,6 +167,7 @@ class MultiscaleSDF(Field):
             return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
         return Jet(*deque(self._walk(x, level, lambda part, points: part.jet(points)), maxlen=1).pop())
 
+    @uncompiled
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
         """See `Field.second_jet`; inside a tapered band the product rule is applied twice."""
         dims = self.resolve_dims(dims)

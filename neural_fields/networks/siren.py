@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..backend.devices import Step, is_traced, over_blocks
+from ..backend.devices import Step, is_traced, over_blocks, uncompiled
 from ..backend.errors import at_least, positive
 from ..backend.kernels.switch import choose
 from ..fields.field import Jet, OneLevelField, SecondJet
@@ -125,10 +125,12 @@ class Siren(OneLevelField):
         for name, _ in self.named_parameters():
             yield name, self.units[name.startswith("output.")]
 
+    @uncompiled
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; ``x`` may have any leading shape, N = 0 included."""
         return self._outputs(x, level, 1)[:, 0].reshape(x.shape[:-1])
 
+    @uncompiled
     def value_features(self, x: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
         """See `Field.value_features`; as many products as a value costs."""
         output, shape = self._outputs(x, level, 1 + self.num_features), x.shape[:-1]
@@ -160,6 +162,7 @@ class Siren(OneLevelField):
         over_blocks(len(rows), self.block_rows(rows.device), prepare, like=rows)
         return output
 
+    @uncompiled
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; the gradient comes from one reverse sweep of matrix products, without autograd.
 
@@ -200,6 +203,7 @@ class Siren(OneLevelField):
             return _FusedJet.apply(rows, self.omega * self.units[0], self.units[1], *parameters)
         return siren_jet(rows, packed(self))
 
+    @uncompiled
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
         """See `Field.second_jet`; one tangent forward for each of the ``dims`` coordinates, without autograd.
 
@@ -409,7 +413,7 @@ class _SirenJet(torch.autograd.Function):
             )
         kept = saved[2 * depth + 3 :]
         output_bar, gradient_bar = cotangents
-        # Autograd materialises the cotangents nobody asked for.
+        # Autograd materialises cotangents that are not needed too.
         assert output_bar is not None
         assert gradient_bar is not None
         g_out = parameters[-2][:1].expand(len(x), -1)

@@ -38,7 +38,7 @@ def march_ahead(
 
 
 class _Chunk:
-    """Some passes of rays, none of which is dropped.
+    """Some passes of rays, without dropping any.
 
     Attributes:
         rays: see `Rays`; those that have ended stay where they were.

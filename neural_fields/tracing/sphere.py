@@ -81,7 +81,7 @@ def sphere_trace(
     taken back. The resolution doubles after every 16 steps of a ray. A change of sign is closed in on by the secant
     rule and bisection in turn. A ray that starts inside the surface looks for the way out.
 
-    With a ``budget``, the paper's mode: so many steps ``t ← t + f_j − δ_j`` on each level (20, 5, 5 in its Tab. 4),
+    With a ``budget``, the paper's mode: that many steps ``t ← t + f_j − δ_j`` on each level (20, 5, 5 in its Tab. 4),
     after which |f| < ``capture`` is a hit.
 
     With ``differentiable``, depth and position carry the derivatives of the implicit function f(o + t d) = 0 with

@@ -127,7 +127,7 @@ finite = _converter(float, math.isfinite, "a number")
 # --- flags ---
 
 AROUND = "degrees around the up axis from the front (30)"
-# Flags of several commands. What each command means by one is said where it is added, unless all mean the same.
+# Flags of several commands. Help texts stand here where all commands mean the same by a flag, else where it is added.
 FLAGS: Mapping[str, dict[str, Any]] = {
     "run": {"metavar": "RUN", "help": "run directory or .safetensors file"},
     "--out": {"required": True, "type": Path, "metavar": "FILE"},
@@ -166,7 +166,7 @@ def add_begin(
     resume: str = "continue the interrupted run in RUN, with its settings",
     force: str = "overwrite the run in RUN",
 ) -> None:
-    """Add ``--resume`` and ``--force``, of which one may be given, and ``--quiet``."""
+    """Add ``--resume`` or ``--force``, and ``--quiet``."""
     begin = parser.add_mutually_exclusive_group()
     begin.add_argument("--resume", action="store_true", help=resume)
     begin.add_argument("--force", action="store_true", help=force)

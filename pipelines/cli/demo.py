@@ -92,7 +92,7 @@ def demo(
 
 
 def _counter(report: Report, stage: str) -> Callable[[int, int], None]:
-    """Tells that so many parts of a stage are done, and of how many."""
+    """A function that reports how many parts of a stage are done, of how many."""
     return lambda done, total: report(Progress(stage, done, total, done / total, {}))
 
 
@@ -106,7 +106,7 @@ def _extract(field: Field, level: int, resolution: int) -> Mesh:
 def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity) -> Mesh:
     """The mesh with colours at its vertices: means of the nearest points, weighted by 1 / distance².
 
-    The mesh is in unit-sphere coordinates, the cloud in input coordinates. Without colours the mesh stays as it is.
+    The mesh is in unit-sphere coordinates, the cloud in input coordinates. Without colours the mesh stays unchanged.
     """
     points = from_cloud(cloud).moved(similarity)
     if points.colors is None:

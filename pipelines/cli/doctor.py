@@ -88,7 +88,7 @@ def _is_asked_of_users(requirement: str) -> bool:
 
 
 def _requirement(requirement: str) -> Finding:
-    """What is there of ``name[extras]>=1.2; extra == "plot"``: the needed, and what can be done without."""
+    """The installed version of a requirement such as ``name[extras]>=1.2; extra == "plot"``; extras are optional."""
     match = re.match(r"([A-Za-z0-9._-]+)(?:\[[^\]]*\])?(?:>=([0-9.]+))?", requirement)
     assert match is not None, requirement
     name, lowest = match[1], match[2] or "0"

@@ -40,7 +40,7 @@ def _check_size(size: Sequence[int] | None) -> None:
 
 
 def _pair(size: Sequence[int] | None) -> Sequence[int] | None:
-    """``--size`` as width and height, of which it may leave out the second."""
+    """``--size`` as width and height; one number stands for both."""
     _check_size(size)
     return None if size is None else (size[0], size[-1])
 
@@ -106,7 +106,7 @@ def _render(arguments: argparse.Namespace) -> int:
 
 
 def _shading(arguments: argparse.Namespace, given: dict[str, object]) -> str | None:
-    """The shading that is asked for; a matcap or a reference asks for its own."""
+    """The shading given by a flag; ``--matcap`` and ``--reference`` imply theirs."""
     asked = {name for name in OWNED if name in given or getattr(arguments, name, None) is not None}
     wanted = [OWNED[name][0] for name in ("matcap", "reference") if name in asked]
     shading = arguments.shading or (wanted[0] if wanted else None)

@@ -96,7 +96,7 @@ def _sample(arguments: argparse.Namespace) -> int:
 
 
 def _faults(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What `statue_scan` is told of the faults that were asked for, in units of the statue."""
+    """The arguments of `statue_scan` for the faults given by flags, in units of the statue."""
     from ...datasets import STATUE_PLACEMENT, ScanFaults
     from ..mesh.solids import length_in
 

@@ -128,7 +128,7 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
 
 
 def _watched(arguments: argparse.Namespace) -> AbstractContextManager[object]:
-    """The run in the browser while it grows, if that is asked for."""
+    """Show the run in the browser while it is trained, with ``--watch``."""
     if not arguments.watch:
         return nullcontext()
     from ..web.watch import Watcher

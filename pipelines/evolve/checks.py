@@ -160,7 +160,7 @@ def _as_dict(change: Change, similarity: Similarity) -> dict[str, Any]:
 
 
 def frame_figures(field: Field, time: float, resolution: int) -> FrameFigures:
-    """Figures of the surface at a time, from a mesh of so many cells along each side."""
+    """Figures of the surface at a time, from a mesh of ``resolution`` cells along each side."""
     still = TimeSlice(field, time)
     surface = surface_of(still, resolution=resolution)
     if surface is None:

@@ -17,7 +17,7 @@ from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
 from .topology import surface_of, topology_of
 
-# So many cells on a side show how many pieces and holes a surface has; smaller ones than theirs do not count.
+# Cells on a side that pieces and holes of a surface are counted on; those that slip through do not count.
 TOPOLOGY_RESOLUTION = 64
 # A fixed step: near a change of topology adaptive ones would shrink to nothing before we can say when that was.
 FOLLOW = Solver(method="rk4", step=0.02)
@@ -45,9 +45,9 @@ def follow_mesh(
 ) -> TrackedMesh:
     """Mesh a surface at the first of ``times`` and follow its vertices (see `CarriedVelocity`) to the others.
 
-    That is possible as long as the surface neither tears nor joins nor closes a hole, and every time is checked: the
-    pieces and the Euler number of the slice are those of the start, the vertices have not lost the surface, and the
-    mesh has not folded over. ``resolution`` is in cells along the cube.
+    The surface must not tear, join or close a hole. At every time the pieces and the Euler number of the slice are
+    compared with those of the start. The vertices must still lie on the surface, and the mesh must not fold over.
+    ``resolution`` is in cells along the cube.
 
     Raises:
         InputError: there is no surface at the start, or it cannot be followed; says to which time.

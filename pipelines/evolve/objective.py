@@ -1,4 +1,4 @@
-"""What ``evolve`` minimises: one level of a field of space-time on what is known, on bounds and on the law."""
+"""What ``evolve`` minimises: losses of a space-time level at known values, at bounds and of the law."""
 
 from __future__ import annotations
 

@@ -146,8 +146,8 @@ def band_points(
 ) -> Tensor:
     """Points ``(n, 4)``, about ``count`` of them, spread evenly over |f| < ``width`` of a four-dimensional field.
 
-    Points anywhere, of which those with |f| < ``reach`` at the coarsest level are moved along ∇f to a value of their
-    own; of a residual level only those in its band are kept.
+    Points anywhere; those with |f| < ``reach`` at the coarsest level are moved along ∇f to a value of their own. Of a
+    residual level only those in its band are kept.
     """
     level, device = field.resolve_level(level), field.deltas.device
     points = uniform_spacetime(6 * count, generator).to(device)  # tried: few are near the surface

@@ -38,11 +38,11 @@ def fitted_scans(
     """The same evolution with fits in place of ``scans``: what is in the ``folder`` already is taken, or goes on.
 
     Where all shapes of a deformation are meshes with the same faces, and no landmarks were given, up to 400 vertices
-    become landmarks, files of which are written beside the fits.
+    become landmarks, written to files beside the fits.
 
     Raises:
         InputError: a cloud cannot be used.
-        Interrupted: a fit was asked to stop; the next call goes on with it.
+        Interrupted: a fit was stopped by Ctrl-C; the next call resumes it.
     """
     runs = {}
     for index, text in enumerate(scans):

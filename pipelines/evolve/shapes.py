@@ -171,7 +171,7 @@ def read_shape(text: str) -> StaticShape:
     field, similarity, _ = load_field(file)
     if field.in_dim != 3:
         raise InputError(f"{file}: moves already; evolve takes static fields, as `mplicits fit` makes them")
-    # In the frame of a larger shape a network is asked far beyond where it was trained, and says anything there.
+    # In the frame of a larger shape a network is evaluated far from where it was trained, with arbitrary values.
     return _meshed(text, Bounded(field), similarity)
 
 

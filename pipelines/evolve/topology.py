@@ -29,7 +29,7 @@ class ChangeOptions:
     one: float = 1e-2  # changes that follow each other so soon are one: on a lattice a neck closes in several places
     most: int = 60  # moments that are meshed on the way, of all changes together
     placed: int = 6  # changes whose place is searched for, of the first ones
-    cells: int = 2  # a place is searched for until it lies in a box of so many cells
+    cells: int = 2  # along the box that a place is searched down to
 
 
 CHANGES = ChangeOptions()

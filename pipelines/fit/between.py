@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 class BetweenOptions:
     """Numbers of `densified`; lengths in the units that each comment says."""
 
-    neighbors: int = 16  # of which a patch is fitted
+    neighbors: int = 16  # that a patch is fitted to
     blended: int = 8  # patches at a place
     block: int = 1 << 15  # rows handled at once, to bound memory
     alike: float = 0.85  # cosine between normals of neighbours on one smooth surface

@@ -43,7 +43,7 @@ class CloudOptions:
     odd: float = 2.0  # opposed over agreeing normals beside a point, above which its own sign is wrong
     soft: float = 0.3  # softening of a dipole over the radius of its disc: more would cancel the sides of thin bars
     soft_guessed: float = 2.0  # softening where normals were estimated, in standard deviations of the noise
-    sides: float = 4.0  # sides of a square bar: one neighbour in so many is on the point's own side
+    sides: float = 4.0  # sides of a square bar: a quarter of the neighbours is on the point's own side
     beside: float = 0.25  # distance to the discs, in spacings, below which their sides give the sign
     doubt: float = 0.25  # distance of a winding number from one half, below which it is in doubt
     rim: float = 0.1  # reach of the discs at the rim of a hole, in units of the domain, where it is in doubt

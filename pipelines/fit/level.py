@@ -72,14 +72,15 @@ class JudgeOptions:
     """Numbers of `held_out` and `Judge`."""
 
     fewest: int = 200  # held-out points: their mean square is known to a tenth
-    wanted: int = 600  # held-out points of clouds of which they are at most `spared`
+    wanted: int = 600  # held-out points where that is at most the share `spared` of the cloud
     spared: float = 0.05
     most: float = 0.1  # largest held-out share; a smaller cloud spares none
     learnt: float = 0.8  # root mean square at training points over that without the level: less is a large gain
     voxel: float = 2.0  # edge of a voxel in spacings: about four points, a gap that neighbours can still fill
     surely: float = 2.0  # standard errors
-    # Part of the schedule from which on training ends where distances and angles are both surely more than without the
-    # level. Levels set to zero in the end had 2.8 to 14 standard errors there (three shapes), kept ones less (four).
+    # Part of the schedule from which on training ends if distances and angles are both significantly more than
+    # without the level. Levels set to zero in the end had 2.8 to 14 standard errors there (three shapes), kept ones
+    # less (four).
     hopeless: float = 0.375
     looks: int = 8  # judgements of a level during its training
 
@@ -162,7 +163,7 @@ class Verdict(NamedTuple):
 
     @property
     def better(self) -> bool:
-        """Whether the level is kept: one error is surely less and the other not surely more, or the level `learns`.
+        """Whether the level is kept: one error is significantly less and the other not more, or the level `learns`.
 
         An angle to estimated normals never counts against a level.
         """
@@ -295,7 +296,7 @@ class Judge:
 class LevelObjective(Objective):
     """The terms of Eq. 4 for one SIREN on ``sources``.
 
-    With a ``judge`` the level returns to earlier weights that were surely better at held-out points, see `take_best`.
+    With a ``judge`` the level returns to earlier weights if those were significantly better, see `take_best`.
     """
 
     def __init__(
@@ -359,11 +360,11 @@ class LevelObjective(Objective):
 
     @property
     def hopeless(self) -> bool:
-        """See `Objective.hopeless`: the level makes distances and angles at held-out points surely worse."""
+        """See `Objective.hopeless`: the level makes distances and angles at held-out points significantly worse."""
         return self.judge is not None and bool(self.kept["hopeless"])
 
     def take_best(self) -> Verdict | None:
-        """Return to the best weights if they are surely better → the verdict; None without a judge.
+        """Return to the best weights if they are significantly better → the verdict; None without a judge.
 
         Otherwise the last weights stay: the decayed learning rate has removed the noise of the batches, which a few
         hundred points hardly show. Last weights that are no better than none do not stay.

@@ -42,7 +42,7 @@ SAMPLING = SampleOptions()
 
 
 class Rows:
-    """Columns of equal length about points: a base of dataclasses of tensors, some of which may be None."""
+    """Columns of equal length about points: a base of dataclasses of tensors or None."""
 
     points: Tensor
 
@@ -217,7 +217,7 @@ def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Gener
 class Remote(NamedTuple):
     """Places of a band far from every point of the cloud, see `remote_samples`."""
 
-    empty: Samples  # surely in- or outside
+    empty: Samples  # clearly inside or outside
     unseen: Samples  # in doubt
 
 
@@ -347,7 +347,7 @@ class BandOptions:
     stray: float = 4.0
     tail: float = 20.0  # largest error over its 90th percentile: a level may miss a thin part as a whole
     widest: float = 2.0  # largest factor by which places on the wrong side widen a band
-    first: int = 4  # one in so many places is tried first: winding numbers are slow, and mostly none is wrong
+    first: int = 4  # a quarter of the places is tried first: winding numbers are slow, and mostly none is wrong
 
 
 BAND = BandOptions()
@@ -415,8 +415,8 @@ def with_wrong_sides(
     """This band, or a wider one that also holds the places which ``field`` puts on the wrong side.
 
     A coarse level may close a thin part by a sheet far from all points, with places behind it deeper than the band,
-    where no finer level would be evaluated. Such places are further than δ on one side and, by the winding number,
-    surely on the other. The new half-width is (1 + ε) max |f| over them, at most `widest` times the old one. ``count``
+    where no finer level would be evaluated. Such places are further than δ on one side and, by a clear winding
+    number, on the other. The new half-width is (1 + ε) max |f| over them, at most `widest` times the old one. ``count``
     places are tried, spread as for level 0, the rest only if there is one among the first part.
     """
     generator = torch.Generator().manual_seed(seed)

@@ -108,7 +108,7 @@ def give_signs(
     """Which normals ``(N, 3)`` point inward, by networks that are trained on the points without them; None if stopped.
 
     With unknown signs |f| = d, |∇f| = 1 and |cos(∇f, N)| = 1 have many minima. The terms here are convex in the values:
-    f = 0 at the points, f = ±d at places that are surely out- or inside, and |f| ≤ d elsewhere. A smooth field that
+    f = 0 at the points, f = ±d at places clearly outside or inside, and |f| ≤ d elsewhere. A smooth field that
     falls from outside goes on falling through the first wall, so both sides of a thin part get opposite gradients.
 
     What is outside comes from winding numbers in one network, which tend to fill hollows, and from `Exterior` in the

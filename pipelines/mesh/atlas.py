@@ -157,7 +157,7 @@ class Decimation:
     closed: bool
 
     def times(self, scale: float) -> Decimation:
-        """The same in other units, of which one of these is ``scale``."""
+        """The same in other units; one of today's is ``scale`` of them."""
         return dataclasses.replace(self, largest=self.largest * scale, mean=self.mean * scale)
 
     def describe(self, unit: str) -> str:

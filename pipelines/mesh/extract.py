@@ -52,7 +52,7 @@ def thin_depth(resolution: int) -> float:
 
 @torch.no_grad()
 def thin_share(field: Field, points: NDArray[np.floating], resolution: int, *, level: int = -1) -> float:
-    """The share of points ``(N, 3)`` on parts thinner than √3 of so many cells.
+    """The share of points ``(N, 3)`` on parts thinner than √3 cells.
 
     Each point is moved onto the surface by x = p − f n / |∇f|, n = ∇f / |∇f|. With d of √3 cells, its part is thin if
     x − n d / 4 is inside and x − n d outside; a point whose x − n d / 4 is outside was not on the surface.
@@ -90,7 +90,7 @@ class MeshOptions:
         level: counted from 0, the coarsest; None is the finest.
         normal_level: level of the normals (neural normal mapping); None is ``level``.
         colors: whether vertices get the colours of the run's texture, if it has one.
-        texture: bake colours and the finest normals into images of so many texels along each side (.glb or .obj).
+        texture: bake colours and the finest normals into images; texels along each side (.glb or .obj).
         texture_faces: triangles to keep of a mesh that is unwrapped.
         faces: triangles to keep of one that is not; None keeps all.
         report: whether to look at the mesh as a printer would; None does so for STL.
@@ -228,7 +228,7 @@ def export_run(
 def _resolution(
     field: Field, asked: int | None, support: Support | None, level: int, say: Callable[[str], None] | None
 ) -> int:
-    """Cells per side; ``say`` hears of parts that are too thin for those that were asked for, or usual."""
+    """Cells per side; ``say`` is called with a warning if parts are too thin for them."""
     say = say or (lambda _: None)
     if support is None or support.seen:
         return asked or RESOLUTIONS[0]
@@ -250,7 +250,7 @@ def _resolution(
 
 
 def _seen(mesh: Mesh, support: Support, say: Callable[[str], None] | None, *, cut: bool) -> Mesh:
-    """What photographs have seen of a mesh, if that is wanted; ``say`` hears how much they have not, if it is much."""
+    """The part of a mesh that photographs have seen, with ``cut``; ``say`` is called if they missed much."""
     part, missed = seen_part(mesh, support)
     if not cut or part is None:
         if say is not None and missed > 0.05:
@@ -296,7 +296,7 @@ def _write_textured(
     options: MeshOptions,
     size: int,
 ) -> None:
-    """Bake the colours, if there are any, and the normals of the finest level, or of the one that was asked for."""
+    """Bake the colours, if there are any, and the normals of ``options.normal_level``, by default the finest."""
     level = field.num_levels - 1 if options.normal_level is None else options.normal_level
     textured_mesh(
         out,

@@ -267,7 +267,7 @@ def _distances(field: Field, points: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def _made(mesh: Mesh, frame: Similarity) -> Made:
-    """The mesh in input coordinates, and what is said about it."""
+    """The mesh in input coordinates, and its report."""
     placed = dataclasses.replace(mesh, vertices=frame.to_input(mesh.vertices))
     return Made(placed, is_closed(mesh), volume(mesh) * frame.scale**3)
 

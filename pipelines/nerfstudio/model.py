@@ -129,7 +129,7 @@ class _Multiscale:
     def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
         """Those of nerfstudio, and bands that follow the deviation; schedules learn how long this training is."""
         trainer = training_callback_attributes.trainer
-        steps = trainer._start_step + trainer.config.max_num_iterations  # it does so many more, if it goes on
+        steps = trainer._start_step + trainer.config.max_num_iterations  # a resumed one does as many again
         for scheduler in training_callback_attributes.optimizers.schedulers.values():
             for factor in scheduler.lr_lambdas:
                 owner = getattr(factor, "__self__", None)

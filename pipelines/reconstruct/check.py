@@ -34,7 +34,7 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DepthCheck:
-    """What is known of the depth maps of a data set."""
+    """How many depth maps a data set has, and how well they fit."""
 
     maps: int  # how many views have one
     inside: float | None = None  # share of the readings that end in the region; None where their scale is not known
@@ -43,7 +43,7 @@ class DepthCheck:
     warnings: tuple[str, ...] = ()  # one line each
 
     def in_words(self, views: int) -> str:
-        """One line, for a data set of so many views."""
+        """One line, for a data set of ``views`` photographs."""
         words = [f"depth maps: {self.maps} of {views} photographs have one"]
         if self.inside is not None:
             words.append(f"{self.inside:.1%} of the readings end in the region")

@@ -37,7 +37,7 @@ class Limits:
     wrong: float = 0.4
     most_wrong: float = 0.1  # share of the views that may be left out as wrong; of more, nothing says which ones are
     lone: float = 0.02  # a mask has a hole if it alone contradicts more than this share of the visual hull
-    few: int = 20  # views below which none is said to have a hole: of few, each may carve much
+    few: int = 20  # views from which one may have a hole: of fewer, each may carve much
     bare: float = 0.005  # share of the object, in the median view, that may lie outside of the visual hull
     sure: float = 0.05  # share of the views that may contradict a point of that hull
 
@@ -276,11 +276,11 @@ def begin(
 ) -> str:
     """Give an untrained scene, in place, the start that its settings ask for; it is a sphere already.
 
-    Returns "hull" (carved by measured rays too, unless it was asked for by name), "depths" (what no measured ray
+    Returns "hull" (carved by measured rays too, unless the setting names it), "depths" (what no measured ray
     passes) or "sphere". ``agreement`` is that of the ``views``, if it is known.
 
     Raises:
-        InputError: a start was asked for that there is not.
+        InputError: the setting names a start that these data do not give.
     """
     base = model.geometry.base if isinstance(model.geometry, MultiscaleSDF) else None
     masked = all(view.mask is not None for view in views) and config.start != "depths"
@@ -311,7 +311,7 @@ def carve(
     resolution: int | None = None,
     empty: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64] | None:
-    """Signed distances to what is left of the unit ball at the vertices of a grid over [−1, 1]³, negative inside.
+    """Signed distances to the carved unit ball at the vertices of a grid over [−1, 1]³, negative inside.
 
     A vertex of the unit ball is inside where `HullOptions.agree` of the views that see it find object within half a
     cell, so that thin parts stay; without views, where ``empty`` ``(E, E, E)``, a grid over the same cube, does not
@@ -346,7 +346,7 @@ def fitting_resolution(views: Sequence[PosedImage], similarity: Similarity) -> i
 def _object_vertices(
     views: Sequence[PosedImage], similarity: Similarity, resolution: int
 ) -> tuple[NDArray[np.bool_], int]:
-    """Vertices that enough views take for object ``(resolution + 1,) * 3``, and how many are asked.
+    """Vertices that enough views take for object ``(resolution + 1,) * 3``, and how many views count.
 
     Those in the unit ball are; without views all of them are object.
     """

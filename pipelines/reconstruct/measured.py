@@ -71,7 +71,7 @@ class MeasuredDepths:
 
     Numbers of a map that is not in the cameras' units become depths by a scale and a shift of its own, `affine` ``(V,
     2)``, 0 until they are known. The sparse points that the view saw say which, if there are sixteen; else `settle`
-    fits them to the surface as it is. The ``seed`` chooses where there are more readings than can be kept.
+    fits them to the present surface. The ``seed`` chooses where there are more readings than can be kept.
 
     Attributes:
         is_loose: whether there are maps for `settle`.

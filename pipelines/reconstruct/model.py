@@ -171,7 +171,7 @@ class SceneModel(nn.Module):
 
 
 def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -> SceneModel:
-    """An untrained scene: a sphere of unknown colour, and so many photographs to learn exposures or poses of."""
+    """An untrained scene: a sphere of unknown colour, with exposures and poses for ``views`` photographs."""
     background = config.background
     if background == "auto":
         background = "white" if has_masks else "outside"

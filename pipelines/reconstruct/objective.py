@@ -44,7 +44,7 @@ class Schedule:
 
 
 class Kind(NamedTuple):
-    """Of which kind a step is: those of one kind do the same operations."""
+    """The kind of a step: steps of one kind do the same operations."""
 
     rays: int  # how many there are
     level: int  # the finest that is switched on
@@ -156,7 +156,7 @@ class SceneObjective(Objective):
         return outcome.terms, outcome.total
 
     def ahead(self, step: int, done: float) -> Kind:
-        """What has to be done on the host before a step, and of which kind the step is."""
+        """Do what a step needs of the host first → the kind of the step."""
         self.done = done
         self.focus.watched(step, self.kept)
         self.look(step, done)
@@ -174,7 +174,7 @@ class SceneObjective(Objective):
         )
 
     def behind(self, step: int, sections: Tensor) -> None:
-        """What has to be done on the host after a step, of which a ray had so many sections, 0-d."""
+        """Do what follows a step on the host; ``sections`` is the number per ray, 0-d."""
         if (step + 1) % self.schedule.near_every == 0:
             self.remember(step, sections)
 
@@ -281,7 +281,7 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         self.replays = Replays(device, recorder or CudaGraphs())
         for group in self.adam.param_groups:
             group["capturable"] = device.type == "cuda"
-        # What rows were asked for, of CHOICES and residual levels, the most of late; and steps that were not taken.
+        # The most rows requested lately, of CHOICES and residual levels; and the number of steps not taken.
         self.peaks = torch.zeros(len(CHOICES) + len(objective.model.geometry.deltas) + 1, device=device)
         self.rooms: dict[Kind, tuple[int, ...]] = {}
         self.asked: dict[int, list[float]] = {}  # by the level that is on: what a ray asked for, at most
@@ -341,7 +341,7 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         return torch.stack([part.to(none) for part in [shapes.asked.get(name, none) for name in CHOICES] + bands])
 
     def _rooms(self, kind: Kind) -> Rooms:
-        """The rooms of a kind of step: those that it has, as long as they suit what was asked for."""
+        """The rooms of a kind of step: those that it has, as long as they hold the rows requested."""
         old, asked = self.rooms.get(kind), self.asked.get(kind.level)
         if asked is None:
             return old
@@ -351,7 +351,7 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         return self.rooms[kind]
 
     def _learn(self, kind: Kind) -> None:
-        """Look at what was asked for in the last steps."""
+        """Look at the rows requested in the last steps."""
         *peaks, lost = self.peaks.tolist()
         self.asked[kind.level] = [peak / kind.rays for peak in peaks]
         self.left_out += int(lost)

@@ -285,7 +285,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         image = render_image(
             self.model, view, self.images.similarity, objective.sampling, level=level, guide=objective.grid
         )
-        # A view that is not trained on has an exposure that nobody knows.
+        # The exposure of a view that is not trained on is unknown.
         return image if self.model.exposures is None else exposed_as(image, view, self.model.background)
 
     def _render_held_out(self) -> list[tuple[PosedImage, ViewImage]]:
@@ -296,7 +296,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         if count:
             self.report(Progress("held-out views", 0, count, 0.0, {}))
         for index, view in enumerate(spread(self.test_views)):
-            # Half of what is left of a time budget is for the texture.
+            # Half of the rest of a time budget is for the texture.
             if pairs and limit is not None and time.monotonic() - begun > limit / 2:
                 self.budget.notes.append(f"{index} of {count} held-out views are measured")
                 break
@@ -415,7 +415,7 @@ def scene_texture(
     progress: Report | None = None,
     seconds: float | None = None,
 ) -> FittedTexture:
-    """Train a `TextureField` on the colours of a scene's surface, see `surface_colors`, in so many ``seconds``.
+    """Train a `TextureField` on the colours of a scene's surface, see `surface_colors`, within ``seconds``.
 
     Raises:
         NoSurfaceError: the geometry has no surface.

@@ -100,7 +100,7 @@ def spread(views: Sequence[PosedImage]) -> list[PosedImage]:
 
 
 def reduced(view: PosedImage, pixels: int) -> PosedImage:
-    """A view in about so many pixels, in linear light; as it is, if it has no more."""
+    """A view in at most about ``pixels`` pixels, in linear light."""
     small = _coarse(view.camera, pixels)
     if small is view.camera:
         return view
@@ -121,7 +121,7 @@ def exposed_as(image: ViewImage, view: PosedImage, background: Tensor) -> ViewIm
     """A rendered view with the gain and offset of each channel that bring it nearest to its photograph.
 
     By least squares over the object's pixels: g C + α o = p − (1 − α) b of the rendered object C, its opacity α and the
-    known background b, both 1 and 0 where there is none. The background stays as it is.
+    known background b, both 1 and 0 where there is none. The background stays unchanged.
     """
     target, share = target_of(view, background), np.ones_like(image.opacity)
     behind = np.zeros_like(image.color)
@@ -212,7 +212,7 @@ def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]
 
 
 def _coarse(camera: Camera, pixels: int) -> Camera:
-    """A camera in about so many pixels; as it is, if it has no more."""
+    """A camera of at most about ``pixels`` pixels."""
     share = math.sqrt(pixels / (camera.width * camera.height))
     return camera if share >= 1 else _scaled(camera, share)
 

@@ -506,7 +506,7 @@ class _Artist:
 
     def _strips(self, camera: Camera) -> list[Camera]:
         """What is drawn at a time; little by little, where each ray costs as much as a painter's."""
-        # A painter gets so many pixels between two reports.
+        # Pixels that a painter draws between two reports.
         return fine_strips(camera, self.options.samples, pixels=1 << 14 if self.painter else None)
 
     def _draw(self, camera: Camera, panel: Panel) -> Image:

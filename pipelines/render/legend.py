@@ -127,7 +127,7 @@ def with_legend(
 ) -> Image:
     """The picture of `draw_slice` with a strip under it that explains lines, colours and scale.
 
-    ``caption`` names the plane. ``iso_step`` is in the field's units, of which one is ``unit`` input units, as shown.
+    ``caption`` names the plane. ``iso_step`` is in the field's units; ``unit`` input units are one of those, as shown.
     """
     width = picture.shape[1]
     text = round(float(np.clip(width / 48, 9, 40)))

@@ -88,7 +88,7 @@ def _visible(vertices: Float64, faces: NDArray[np.integer], camera: Camera) -> t
     """Pixels ``(P,)`` that see a face, the nearest face ``(P,)``, and weights ``(P, 3)`` of its corners in space."""
     z = camera.project(torch.from_numpy(vertices))[1].numpy()
     cut = clip(z - _near(z), faces)
-    # Every vertex of what is left lies between two old ones: an old one, between itself and itself.
+    # Every vertex after the cut lies between two old ones: an old one, between itself and itself.
     old, none = np.arange(len(vertices)), np.zeros(len(vertices))
     kept, dropped = np.concatenate((old, cut.kept)), np.concatenate((old, cut.dropped))
     share = np.concatenate((none, cut.share))[:, None]

@@ -1,4 +1,4 @@
-"""Posed photographs of a mesh from a file, in the studio of the exact scenes: to reconstruct what is known."""
+"""Posed photographs of a mesh from a file, in the studio of the exact scenes: a reconstruction whose truth is known."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class Metrics:
         shell_iou: the paper's "IoU": overlap of the sets of voxels, ``voxel`` wide, that hold samples.
         components: connected components of the mesh.
         closed: whether every edge of the mesh has a face on both sides.
-        mean_distance: mean unsquared distance over both directions, in INPUT units, ``scale`` of which are one unit.
+        mean_distance: mean unsquared distance over both directions, in INPUT units; ``scale`` of them are one unit.
         samples: on each surface.
         notes: what the reader of the figures should know.
         visible: the same where two photographs or more see the reference; None if that was not asked for.

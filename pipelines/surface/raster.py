@@ -124,8 +124,8 @@ def _within(count: Int64) -> Int64:
 def _between(corners: NDArray[np.floating], row: Int64, i: Int64, low: Int64, high: Int64) -> tuple[Int64, Int64]:
     """First column to test on the line x = ``i`` through the triangle ``corners[row]``, and how many.
 
-    The interval between the two crossed edges is widened by the error of a column's test: on an edge from (x₀, y₀) by
-    (Δx, Δy) a few roundings of |Δx||j − y₀| + |Δy||i − x₀|, so in y a few roundings of the triangle's height.
+    The interval between the two crossed edges is widened by the error of a column's test. On an edge from (x₀, y₀) by
+    (Δx, Δy) that is a few roundings of |Δx||j − y₀| + |Δy||i − x₀|. In y it is a few roundings of the height.
     """
     lowest, highest = np.full(len(row), np.inf), np.full(len(row), -np.inf)
     for k in range(3):

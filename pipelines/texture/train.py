@@ -62,7 +62,7 @@ class BandSamples(NamedTuple):
 
 
 def read_colors(path: str | Path, *, samples: int, seed: int, columns: str | None = None) -> PointCloud:
-    """Read a cloud with colours; a mesh gives so many ``samples``, with the colours of its texture or its vertices.
+    """Read a cloud with colours; a mesh gives ``samples`` points, with the colours of its texture or its vertices.
 
     Raises:
         InputError: the file cannot be read, or has no colours.
@@ -272,7 +272,7 @@ class _Texturing(Training[TextureConfig, Field]):
             return cloud, band_samples
 
         def part(count: int) -> tuple[PointCloud, int]:
-            """So many of the points, and as large a part of the band's."""
+            """``count`` of the points, and as large a part of the band's."""
             share = count / max(len(cloud), 1)
             return _thinned(cloud, share, self.config.seed), max(int(share * band_samples), FEWEST_COLORED)
 

@@ -215,7 +215,7 @@ def is_field(path: str | Path) -> bool:
 
 
 def load_still(path: str | Path, time: float | None = None, *, device: torch.device | str = "cpu") -> SavedField:
-    """The field of a run as it is, or, if it moves, that of one moment in [0, 1].
+    """The field of a run; if it moves, that of one moment in [0, 1].
 
     Raises:
         InputError: there is no such run; it moves and no time is given, or the other way round; or the time is not
@@ -289,7 +289,7 @@ def kept_cloud(run: Path) -> Path:
 def named_cloud(source: str, run: Path | None) -> dict[str, str]:
     """Where the cloud of a run directory is, for a record, so that `fitted_cloud` finds it from any folder.
 
-    ``cloud`` is the absolute path; a source that is no file stays as it is. ``cloud_from_run`` is the path from the
+    ``cloud`` is the absolute path; a source that is no file stays unchanged. ``cloud_from_run`` is the path from the
     run's directory, which holds when both are moved together.
     """
     file = Path(source)
@@ -537,7 +537,7 @@ def _check_whole(run: Path) -> None:
             digest = json.loads((run / RECORD_FILE).read_text(encoding="utf-8"))["files"][FIELD_FILE]
             held = (run / FIELD_FILE).read_bytes()
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            return  # an older run, or a field without a record; what is damaged is said by who reads it
+            return  # an older run, or a field without a record; a reader reports damage
         if _digest(held) == digest:
             return
         time.sleep(0.05)  # replaced between two looks

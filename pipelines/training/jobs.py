@@ -20,8 +20,8 @@ from .trainer import Interrupted, shared_flag, stop_on_signals
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# Read by Ray when it is imported: no usage reports, devices stay visible to tasks that ask for none, and workers do not
-# give way to whatever else runs: they are what was asked for, and their seconds are measured.
+# Read by Ray when it is imported: no usage reports, devices stay visible to tasks that ask for none, and workers keep
+# the usual priority, as their seconds are measured.
 RAY_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
@@ -84,7 +84,7 @@ def run_streams(
     device: torch.device,
     report: Callable[[Outcome[Item, Result]], None] | None = None,
 ) -> list[Outcome[Item, Result]]:
-    """`run_jobs` in threads of this process, so many at a time, each with a CUDA stream of its own (on a CPU: threads).
+    """`run_jobs` in ``streams`` threads of this process, each with a CUDA stream of its own (on a CPU: threads alone).
 
     A training of small networks keeps a small part of a GPU busy; several streams are worked on at the same time, with
     the same results.

@@ -59,7 +59,7 @@ def progress_bars(*, clock: Callable[[], float] = time.monotonic) -> Iterator[Re
 
 
 def time_words(seconds: float) -> str:
-    """A time to wait, as exactly as it is worth: ``8 s``, ``2 min 10 s``, ``1 h 05 min``.
+    """A time to wait in two units at most: ``8 s``, ``2 min 10 s``, ``1 h 05 min``.
 
     Example:
         >>> [time_words(seconds) for seconds in (8.4, 131, 599, 3900)]

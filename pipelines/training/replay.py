@@ -29,7 +29,7 @@ class Recorder(ABC):
         """A function that does ``work`` again, and where its results are found afterwards; nothing is done yet."""
 
 
-# PyTorch waits for the whole device before it records, which nobody else may be doing then.
+# PyTorch waits for the whole device before it records: one thread at a time may do it.
 _recording = threading.Lock()
 
 
@@ -73,7 +73,7 @@ class _Kind:
 
 
 class Replays:
-    """Works by their kinds: done once, recorded by a ``recorder``, and then replayed. So many kinds are ``kept``.
+    """Works by their kinds: done once, recorded by a ``recorder``, and then replayed. At most ``kept`` kinds are kept.
 
     Where recording fails (another version of PyTorch, no memory left) works are done as they are, and `refused` is why.
     """
@@ -84,7 +84,7 @@ class Replays:
         self._kinds: OrderedDict[Hashable, _Kind] = OrderedDict()
 
     def do(self, kind: Hashable, work: Work) -> Results:
-        """Do a work, as it is or by replay; the results are overwritten when a work of the same kind is done again.
+        """Do a work, directly or by replay; the results are overwritten when a work of the same kind is done again.
 
         Works of one ``kind`` do the same operations of the device, on the same memory but for what they make; what they
         need of the host is `handed` to them.

@@ -31,7 +31,7 @@ class BudgetOptions:
     fewest_samples: int = 5_000  # of each kind
     sampling_share: float = 1 / 3  # of the time, for samples, where it is too short for all
     least_seconds: float = 0.5  # of training where a budget leaves none
-    timed: int = 4  # steps, of which the fastest counts
+    timed: int = 4  # steps; the fastest counts
     timing_share: float = 0.02  # of the time left that timed steps may take
 
 
@@ -135,7 +135,7 @@ def step_seconds(step: Callable[[], Tensor], left: float) -> float:
 def affordable(
     make: Callable[[int], object], count: int, seconds: float, *, fewest: int = BUDGET.fewest_samples
 ) -> int:
-    """How many samples can be made in so many seconds: from ``fewest`` to ``count``.
+    """How many samples can be made within ``seconds``: from ``fewest`` to ``count``.
 
     ``make`` makes a half and twice the ``fewest``, which are timed and dropped. More cost the difference.
     """
@@ -258,5 +258,5 @@ class Training(ABC, Generic[C, F]):
         return self.costs[level]
 
     def timed_step(self, level: int) -> Callable[[], Tensor]:
-        """A loss of a level as it is computed in a training step, on networks that are not trained."""
+        """The loss of a level in a training step, on networks that are not trained."""
         raise NotImplementedError(f"{type(self).__name__} has no levels")

@@ -241,7 +241,7 @@ def _names(cls: type) -> list[str]:
 
 
 def _without_none(kind: Any) -> Any:
-    """The X of ``X | None``; any other annotation as it is."""
+    """The X of ``X | None``; any other annotation unchanged."""
     if get_origin(kind) is types.UnionType or get_origin(kind) is Union:
         (kind,) = (arg for arg in get_args(kind) if arg is not types.NoneType)
     return kind

@@ -24,7 +24,7 @@ Rate = Callable[[float], float]
 
 
 class Interrupted(Exception):  # noqa: N818  what happened is no error
-    """Training was asked to stop, and a usable checkpoint was written.
+    """Training was stopped by Ctrl-C, and a usable checkpoint was written.
 
     Attributes:
         directory: the run directory, for ``--resume``; None if the fit had none.
@@ -309,8 +309,8 @@ class Focus:
 
     The chance of a pixel, one of the n in a strip with the error e, is ``(1 - share) / N + share · e / (n Σ e)`` of N
     pixels: what few photographs show is learnt late from even samples. With ``share`` below one no pixel is forgotten,
-    and one that is always wrong has not all. A ``strip`` is so many neighbours of a line; 1 for samples that are no
-    neighbours.
+    and one that is always wrong has not all. A ``strip`` is a number of neighbours on a line; 1 for samples that are
+    no neighbours.
     """
 
     def __init__(self, pixels: int, share: float, device: torch.device, *, strip: int = 16) -> None:

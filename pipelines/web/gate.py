@@ -14,7 +14,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
-# Nobody frames a page of ours, caches it or learns its address.
+# No other page frames one of ours, caches it or learns its address.
 HEADERS: Mapping[str, str] = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",

@@ -53,7 +53,7 @@ def shader_levels(field: Field) -> list[Siren] | None:
 
 
 def network_layers(network: Siren, bits: int | None, *, channels: int = 1) -> list[Layer]:
-    """The layers of a network, sine layers in turns, the output last, of which ``channels`` are kept.
+    """The layers of a network, sine layers in turns; the output, with ``channels`` rows kept, is last.
 
     Weights between sine layers, nearly all there are, are rounded to ``bits`` bits (None: not at all): code times the
     scale of its row. First layer, output and biases stay. In space and time, weights of time become `Layer.rate`.

@@ -21,7 +21,7 @@ from .assembly import field_file, fill_page
 from .export import Packed
 from .gate import Gate
 
-PORTS = range(8080, 8180)  # of which the first free one is taken
+PORTS = range(8080, 8180)  # the first free one is taken
 
 
 class PageServer:

@@ -65,7 +65,7 @@ class _Choice:
         self.colored = False
 
     def look(self, part: Any) -> None:
-        """Count what is left out, and check for colours: without any, writers fill the columns with 0."""
+        """Count the points left out, and check for colours: without any, writers fill the columns with 0."""
         self.names = ["x", "y", "z", *(name for name in part.point_format.dimension_names if name not in "XYZ")]
         self.points += len(part)
         self.withheld += int(np.count_nonzero(part.withheld))

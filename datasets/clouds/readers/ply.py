@@ -241,7 +241,7 @@ def _cut_off(path: Path, element: _Element) -> InputError:
 
 
 def _list_length(data: bytes, at: int, kind: str, item: str) -> int:
-    """The length of the list that begins at ``at``; a ValueError if what is left of the file cannot hold it."""
+    """The length of the list that begins at ``at``; a ValueError if the rest of the file cannot hold it."""
     length = float(np.frombuffer(data, kind, 1, at)[0])
     left = len(data) - at - np.dtype(kind).itemsize
     if not (length.is_integer() and 0 <= length <= left // np.dtype(item).itemsize):

@@ -70,7 +70,7 @@ def read_cloud(path: str | Path, *, columns: str | None = None, drop_noise: bool
 
 
 def read_mesh(path: str | Path) -> tuple[PointCloud, NDArray[np.int64]]:
-    """The vertices and the triangles ``(F, 3)``, of which there may be none, of a PLY, OBJ, STL or OFF file."""
+    """The vertices and the triangles ``(F, 3)``, F ≥ 0, of a PLY, OBJ, STL or OFF file."""
     path = check_cloud_path(path)
     with readable(path):
         return MESH_READERS[path.suffix.lower()](path)

@@ -247,7 +247,7 @@ class _Records:
         return struct.unpack_from("<" + form, self.data, start)
 
     def array(self, form: str, count: int) -> Int64:
-        """So many numbers of one kind."""
+        """The next ``count`` numbers of one kind."""
         start, kind = self.place, np.dtype(form)
         self.skip(count * kind.itemsize)
         return np.frombuffer(self.data, kind, count, start).astype(np.int64)

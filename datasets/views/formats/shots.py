@@ -42,8 +42,9 @@ class DepthSource:
     Attributes:
         folder: with a file for each photograph, of its name but for the extension (16-bit PNG, TIFF, NPY, NPZ); None
             takes the files that the data set names.
-        kind: metric: depths z along the axis of view in the units of the cameras; relative: z = a m + b of the map's
-            numbers m, with an unknown scale a > 0 and shift b for each photograph; disparity: 1 / z = a m + b.
+        kind: what the map's numbers m are. Metric: depths z along the axis of view, in the units of the cameras.
+            Relative: z = a m + b with an unknown scale a > 0 and shift b for each photograph. Disparity: 1 / z =
+            a m + b.
         scale: numbers in the files per unit; see `read_depth`.
     """
 

@@ -82,7 +82,7 @@ def begun(project: Path, asked: dict[str, Any], kind: type[T]) -> T | None:
 
 
 def write_record(project: Path, record: dict[str, Any]) -> None:
-    """Write what was asked, and the result under ``found`` if there is one, in one step."""
+    """Write the request, and the result under ``found`` if there is one, in one step."""
     half = project / f".{RECORD_FILE}"
     text = json.dumps(record, indent=1, default=lambda _: "")  # the only path is that of the project, which may move
     half.write_text(text, encoding="utf-8")

@@ -79,7 +79,7 @@ class Packed(NamedTuple):
 
 @torch.no_grad()
 def pack(parameters: Sequence[Tensor], omega: float, gain: float) -> Packed:
-    """Pack a SIREN by a few dozen small operations on its device, none of which waits.
+    """Pack a SIREN by a few dozen small operations on its device, without waiting.
 
     ``omega`` is ω₀ times the unit of the sine layers' parameters, ``gain`` the factor of the output.
     """

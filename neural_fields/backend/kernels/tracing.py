@@ -24,7 +24,7 @@ from .launch import half_scratch, launch
 from .levels import Levels
 from .tensor_tiles import keep, value_of_tile
 
-# One network of so many units leaves registers enough to keep rays there too.
+# One network of up to this width leaves registers enough to keep rays there too.
 IN_REGISTERS = 128
 
 
@@ -130,7 +130,7 @@ def look_at(
     closed = new_high < infinite
     width = tl.where(closed, new_high - new_low, 0.0)
     span = tl.where(closed & (new_low_value < infinite), new_low_value - new_high_value, 1.0)
-    span = tl.where(span == 0, 1.0, span)  # of rays that have ended, on places that nobody takes
+    span = tl.where(span == 0, 1.0, span)  # of rays that have ended; these places are not used
     chord = new_low + width * tl.where(new_low_value < infinite, new_low_value / span, 1.0)
     halved = (enclosed == 0) | (2 * width <= high - low)
     closing = tl.where(halved, chord, new_low + width / 2)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from bounds import assert_within, rounding
 from fields import cube
-from mplicits.neural_fields import MultiscaleSDF, Siren
+from mplicits.neural_fields import Siren
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -113,18 +113,3 @@ def test_a_second_jet_costs_two_and_a_half_jets(training: bool, times: float) ->
         counts.append(counter.get_total_flops())
     # The other products have at most three rows or columns, 3 / width of those.
     assert 0 < counts[1] <= (times + 3 * 3 / 64) * counts[0]
-
-
-@pytest.mark.filterwarnings("ignore")  # those of PyTorch's compiler
-@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
-def test_compiled_jets_are_those_of_eager(backend: str) -> None:
-    torch.compiler.reset()
-    sdf = MultiscaleSDF.from_widths([(16, 2), (24, 2)], omegas=[10, 20], deltas=[0.3], taper=0.3, num_features=4)
-    x = cube(64, dtype=torch.float32)
-    assert 0 < int(sdf.in_band(x, level=1).sum()) < 64
-    torch.testing.assert_close(torch.compile(sdf.value, backend=backend)(x), sdf.value(x), rtol=1e-5, atol=1e-5)
-    plain, compiled = sdf.jet(x), torch.compile(sdf.jet, backend=backend)(x)
-    torch.testing.assert_close(tuple(compiled), tuple(plain), rtol=1e-5, atol=1e-5)
-    losses = [(jet.gradient.norm(dim=-1) - 1).square().mean() for jet in (compiled, plain)]
-    ours, theirs = (torch.autograd.grad(loss, sdf.parameters(), materialize_grads=True) for loss in losses)
-    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-4)
