@@ -66,6 +66,7 @@ def sample_textured(mesh: TexturedMesh, count: int, *, seed: int) -> PointCloud:
 
 
 def _read_ply(path: Path) -> TexturedMesh:
+    """A PLY mesh with the colours of its vertices."""
     cloud, faces = read_ply_mesh(path)
     if not len(faces):
         raise InputError(f"{path}: face: there are none; a cloud with colours is read as it is, without its texture")

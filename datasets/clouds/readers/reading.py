@@ -29,7 +29,7 @@ MESH_READERS: Mapping[str, Callable[[Path], tuple[PointCloud, NDArray[np.int64]]
 )
 """What reads which extension as vertices and triangles."""
 
-_TABLES: dict[str, Callable[[Path, str | None], PointCloud]] = {
+TABLE_READERS: dict[str, Callable[[Path, str | None], PointCloud]] = {
     ".ply": read_ply,
     **dict.fromkeys((".xyz", ".txt", ".asc", ".csv", ".pts"), read_text),
     ".npy": read_npy,
@@ -37,9 +37,11 @@ _TABLES: dict[str, Callable[[Path, str | None], PointCloud]] = {
     ".pcd": read_pcd,
     ".e57": read_e57,
 }
+"""What reads which extension as a cloud, with the names of its columns where the file has none."""
+
 _LAS = (".las", ".laz")
 
-CLOUD_SUFFIXES: tuple[str, ...] = (*_TABLES, *(end for end in MESH_READERS if end not in _TABLES), *_LAS)
+CLOUD_SUFFIXES: tuple[str, ...] = (*TABLE_READERS, *(end for end in MESH_READERS if end not in TABLE_READERS), *_LAS)
 """Extensions that `read_cloud` knows."""
 
 
@@ -59,8 +61,8 @@ def read_cloud(path: str | Path, *, columns: str | None = None, drop_noise: bool
     with readable(path):
         if suffix in _LAS:
             cloud = read_las(path, columns, drop_noise=drop_noise)
-        elif suffix in _TABLES:
-            cloud = _TABLES[suffix](path, columns)
+        elif suffix in TABLE_READERS:
+            cloud = TABLE_READERS[suffix](path, columns)
         elif columns is not None:
             raise InputError(f"{path}: --columns is for tables; {suffix[1:].upper()} files say what they hold")
         else:

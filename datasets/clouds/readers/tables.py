@@ -19,7 +19,7 @@ _MARKS = re.compile(r"^\s*(//|[#;%!])[#;%!/\s]*")  # before a comment
 
 
 def read_text(path: Path, columns: str | None = None) -> PointCloud:
-    """A text table; columns are separated by commas, semicolons, tabs or spaces.
+    """A text table with commas, semicolons, tabs or spaces between columns, which a header or ``--columns`` names.
 
     A line before the numbers may name the columns (see `choose_layout`). The counts of points in PTS files are skipped.
     """
@@ -119,7 +119,7 @@ def is_number(word: str) -> bool:
 
 
 def read_npy(path: Path, columns: str | None = None) -> PointCloud:
-    """One array ``(N, C)``, or a structured one with names; see `choose_layout`."""
+    """One array ``(N, C)`` whose columns ``--columns`` names or their values show, or a structured one with names."""
     array = read_arrays(path)
     if not isinstance(array, np.ndarray):
         raise InputError(f"{path}: an NPZ archive under another name; rename it to .npz")

@@ -50,7 +50,8 @@ def test_rows_of_table_4_in_each_mode(bench):
         assert row.agreement.image_error < 0.3
         if row.mode == "adaptive":
             assert (row.agreement.holes, row.agreement.false_hits) == (0, 0)
-            assert row.agreement.image_error < 0.01
+            # Mapped normals are those of a finer level at points of a coarser one.
+            assert row.agreement.image_error < (0.05 if row.model.endswith("NM") else 0.01)
             assert row.agreement.depth_error < 1e-3
             assert row.agreement.mesh_depth_error < 1e-3
 

@@ -286,8 +286,9 @@ def test_pictures_that_cannot_be_used_are_refused(tmp_path: Path, capsys: pytest
 
 
 @pytest.mark.slow
-def test_a_painted_sphere_is_recovered_from_its_pictures(tmp_path: Path) -> None:
+def test_a_painted_sphere_is_recovered_from_its_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """24 views of 64², somewhere in the world, whose region is found from their masks; a minute or two."""
+    monkeypatch.undo()  # begins as a user's training does
     scene = SCENES["painted-sphere"]()
     write_transforms(tmp_path / "data", moved(render_scene(scene, views=24, size=64), WORLD))
     small = {"widths": (64, 96), "depths": (2, 3), "features": 16, "color_width": 96, "color_depth": 2}
