@@ -238,7 +238,7 @@ def reason_to_skip(line: str) -> str | None:
     elsewhere = {  # run by tests of their own, where there is what they need
         "pip": "installs from the network",
         **dict.fromkeys(("ns-train", "ns-mplicits-export"), "tests/pipelines/nerfstudio runs it"),
-        "python tests/hosts/run.py": "needs a clone of the host",
+        "python -m benchmarks.hosts.run": "needs a clone of the host",
     }
     for begin, reason in elsewhere.items():
         if line.startswith(f"{begin} "):

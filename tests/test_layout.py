@@ -38,7 +38,7 @@ LATE = {"torchdiffeq", "trimesh"}  # and what only inside a function that needs 
 KERNELS = ("neural_fields/backend/kernels", "neural_fields/tracing/picture.py")
 
 # The same for benchmarks, which may import from any room above, by its installed name.
-MEASURING = ("harness", "peers", "shapes", "costs", "scenes", "motion", "paper", "cli")
+MEASURING = ("harness", "hosts", "peers", "shapes", "costs", "scenes", "motion", "paper", "cli")
 BENCHMARKS = tuple(f"benchmarks/{name}" for name in MEASURING)
 
 

@@ -1,4 +1,4 @@
-"""nerfstudio's methods on its stand-in; tests/hosts/test_nerfstudio.py runs them in nerfstudio itself."""
+"""nerfstudio's methods on its stand-in; test_installed.py runs them in nerfstudio itself."""
 
 import importlib
 import sys

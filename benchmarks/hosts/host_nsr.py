@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from host_common import EVERY, LOOKS, MORE_STEPS, RAYS, RESOLUTION, applied, changes, in_ball, now, surface
-from nsr_packages import cpu_for_cuda, install
-from omegaconf import OmegaConf
 from torch import Tensor
+
+from .host_common import EVERY, LOOKS, MORE_STEPS, RAYS, RESOLUTION, applied, changes, in_ball, now, surface
+from .nsr_packages import cpu_for_cuda, install
 
 CONFIG = "configs/neus-dtu-wmask.yaml"
 CELLS = 32  # of the occupancy grid along an axis; the host's 128 are for a GPU
@@ -65,6 +65,7 @@ class Training:
         self.optimizer, self.schedule = made["optimizer"], made["lr_scheduler"]["scheduler"]
 
     def step(self) -> None:
+        """One training step, as Lightning would make it."""
         batch: dict[str, Tensor] = {}
         self.system.on_train_batch_start(batch, self.system.global_step)
         loss = self.system.training_step(batch, self.system.global_step)["loss"]
@@ -75,10 +76,12 @@ class Training:
         self.system.global_step += 1
 
     def state(self) -> tuple[list[dict[str, Any]], int]:
+        """The states of the model, the optimizer and its schedule, and the number of steps."""
         parts = (self.system, self.optimizer, self.schedule)
         return [part.state_dict() for part in parts], self.system.global_step
 
     def load(self, state: tuple[list[dict[str, Any]], int]) -> None:
+        """Go on from a `state`."""
         states, self.system.global_step = state
         for part, kept in zip((self.system, self.optimizer, self.schedule), states, strict=True):
             part.load_state_dict(kept)
@@ -106,6 +109,7 @@ def colors(system: Any, scene: Any) -> float:
 
 
 def work(scene: Path, seed: int) -> dict[str, Any]:
+    """Train in the current folder, a copy of the host, and measure."""
     sys.path.insert(0, str(Path.cwd()))
     install()
     with cpu_for_cuda():
@@ -114,6 +118,7 @@ def work(scene: Path, seed: int) -> dict[str, Any]:
 
 def _work(scene: Path, seed: int) -> dict[str, Any]:
     from datasets.dtu import DTUDatasetBase  # pyright: ignore[reportAttributeAccessIssue, reportMissingImports]
+    from omegaconf import OmegaConf  # pyright: ignore[reportMissingImports]
     from utils.misc import load_config  # pyright: ignore[reportMissingImports]
 
     rays, samples, steps = map(int, Path("settings.txt").read_text().split())

@@ -1,6 +1,6 @@
 """Trains NeuS or instant-nsr-pl as it is, and by the lines of docs/drop-in.md; prints what each cost and gave.
 
-    python tests/hosts/run.py --neus path/to/NeuS --data path/to/dtu_scan24 --steps 240 --rays 64 --seeds 0 1 2
+    python -m benchmarks.hosts.run --neus path/to/NeuS --data path/to/dtu_scan24 --steps 240 --rays 64 --seeds 0 1 2
 
 Each run is a copy of the clone in a temporary folder: unchanged (``host``), with the document's lines (``ours``), or
 without its other colour network (``ours, 256 features``; ``ours, no encoding``; ``ours, deeper`` has the paper's deeper
@@ -13,6 +13,7 @@ Colours are measured in every eighth view, which is kept from the training, and 
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -21,27 +22,30 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+ROOT = Path(__file__).parents[2]  # where benchmarks are found from a host's folder
 ROWS = {"neus": ("host", "ours", "ours, 256 features", "ours, no encoding", "ours, deeper"), "nsr": ("host", "ours")}
 
 
 def module(host: str) -> Any:
     """How to set up and train a host; read when it is chosen, as each needs packages of its own."""
-    return import_module(f"host_{host}")
+    return import_module(f".host_{host}", __package__)
 
 
 def run(args: argparse.Namespace, host: str, scene: Path, row: str, seed: int) -> dict[str, Any]:
     """One training in a process and a temporary folder of its own."""
     with tempfile.TemporaryDirectory() as folder:
         module(host).set_up(args, getattr(args, host), scene, row, Path(folder))
-        words = [sys.executable, Path(__file__).resolve(), f"--{host}", ".", "--data", scene.resolve(), "--work", seed]
+        words = [sys.executable, "-m", __spec__.name, f"--{host}", ".", "--data", scene.resolve(), "--work", seed]
         words = [str(word) for word in words]
-        done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(done.stdout + done.stderr)
     return json.loads(done.stdout.splitlines()[-1])
 
 
 def main() -> None:
+    """Train the rows that are not kept yet, and print all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument("--neus", type=Path, help="clone of NeuS")

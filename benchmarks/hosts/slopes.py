@@ -1,6 +1,6 @@
 """What one step of a training does to the slopes of a field while it moves its values: NeuS's network, SIRENs by depth.
 
-    python tests/hosts/slopes.py --neus path/to/NeuS
+    python -m benchmarks.hosts.slopes --neus path/to/NeuS
 
 Adam's first step at NeuS's rate follows random errors of the values at 256 points in the ball. Root mean squares of
 what changes are compared; the quotient is a frequency, in radians per unit, which the eikonal loss has to correct.
@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from host_common import in_ball
-from mplicits.neural_fields import MultiscaleSDF, NeuSGeometry, fit_sphere
+from mplicits.neural_fields import MultiscaleSDF, NeuSGeometry, Siren, fit_sphere
 from torch import Tensor, nn
+
+from .host_common import in_ball
 
 RATE = 5e-4  # NeuS's
 DRAWS, ERRORS, POINTS = 4, 256, 2000
@@ -47,12 +48,13 @@ def moved(network: Any, x: Tensor) -> tuple[float, float]:
 
 def sine_network(width: int, depth: int, omega: float) -> nn.Module:
     """A coarse level in NeuS's shell, begun as a sphere."""
-    sdf = MultiscaleSDF.from_widths([(width, depth)], omegas=[omega], deltas=[], num_features=256)
-    fit_sphere(sdf.base, radius=RADIUS)
-    return NeuSGeometry(sdf, scale=SCALE, learning_rate=RATE)
+    base = Siren(width, depth, omega=omega, num_features=256)
+    fit_sphere(base, radius=RADIUS)
+    return NeuSGeometry(MultiscaleSDF(base, [], []), scale=SCALE, learning_rate=RATE)
 
 
 def main() -> None:
+    """Print a row for each network."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--neus", type=Path, required=True, help="clone of NeuS")
     sys.path.insert(0, str(parser.parse_args().neus))

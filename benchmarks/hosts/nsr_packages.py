@@ -35,6 +35,7 @@ class HashGrid(HashEncoding):
         self.n_input_dims, self.n_output_dims = 3, self.size
 
     def forward(self, x: Tensor) -> Tensor:
+        """Features ``(N, C)`` of points ``(N, 3)`` of the unit cube."""
         return super().forward(2 * x - 1)
 
 
@@ -44,6 +45,7 @@ class SphericalHarmonics(nn.Module):
     n_input_dims, n_output_dims = 3, 16
 
     def forward(self, directions: Tensor) -> Tensor:
+        """Values ``(N, 16)`` at directions ``(N, 3)``."""
         x, y, z = (2 * directions - 1).unbind(-1)
         one = torch.ones_like(x)
         rows = (
@@ -57,6 +59,7 @@ class SphericalHarmonics(nn.Module):
 
 
 def encoding(_dims: int, config: Mapping[str, Any]) -> nn.Module:
+    """The encoding that tiny-cuda-nn would make of a configuration."""
     return {"HashGrid": lambda: HashGrid(config), "SphericalHarmonics": SphericalHarmonics}[config["otype"]]()
 
 

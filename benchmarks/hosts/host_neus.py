@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from host_common import EVERY, LOOKS, MORE_STEPS, RAYS, RESOLUTION, applied, changes, in_ball, now, surface
+
+from .host_common import EVERY, LOOKS, MORE_STEPS, RAYS, RESOLUTION, applied, changes, in_ball, now, surface
 
 DEEPER = "[(128, 2), (256, 3)]", "[(128, 4), (256, 5)]"  # what `ours, deeper` changes: the paper's networks for images
 SHORT = "Short trainings in NeuS"  # the section whose lines `--short` adds, the host's own row's too
@@ -54,6 +55,7 @@ class Course:
         self.look: Any = None
 
     def add_scalar(self, name: str, _value: object, step: int) -> None:
+        """Look at the colours at the end of each step."""
         if name == "Statistics/psnr" and self.look is not None:  # the last of a step
             self.look(step)
 
