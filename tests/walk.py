@@ -83,6 +83,8 @@ def _callers(frame: FrameType) -> Iterator[FrameType]:
 @cache
 def _place(code: CodeType) -> Path | None:
     """The file of this project that a piece of code is in, as a path of the repository."""
+    if code.co_qualname == "uncompiled.<locals>.call":  # a wrapper of methods of other files
+        return None
     path = Path(code.co_filename)
     inside = path.relative_to(HOME) if path.is_relative_to(HOME) else Path()
     return ROOT / inside if inside.parts[:1] and inside.parts[0] in ("neural_fields", "datasets", "pipelines") else None
