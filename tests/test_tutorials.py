@@ -71,7 +71,9 @@ def test_a_scan_of_ones_own(tmp_path: Path) -> None:
 
 def test_the_notebook_is_its_script() -> None:
     script = NOTEBOOK.with_suffix(".py").read_text(encoding="utf-8")
-    assert NOTEBOOK.read_text(encoding="utf-8") == notebook_of(script), "python tests/notebook.py docs/tutorials/*.py"
+    assert NOTEBOOK.read_text(encoding="utf-8") == notebook_of(script), (
+        "python tests/helpers/notebook.py docs/tutorials/*.py"
+    )
     assert sum(kind == "markdown" for kind, _ in cells_of(script)) >= 5
 
 

@@ -1,6 +1,6 @@
 """Files that are written whole or not at all.
 
-All that must survive a kill or a full disk goes through `write`, `sync`, `rename` and `remove` (see `tests/faults.py`).
+All that must survive a kill or a full disk goes through `write`, `sync`, `rename` and `remove`; tests let them fail.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A notebook from a script in the percent format, written beside it: ``python tests/notebook.py SCRIPT.py``.
+"""A notebook from a script in the percent format, written beside it: ``python tests/helpers/notebook.py SCRIPT.py``.
 
 ``# %%`` begins a cell, ``# %% [markdown]`` one of words. Jupyter is not needed.
 """

@@ -1,4 +1,4 @@
-"""How often an accelerator keeps the host waiting: ``python tests/waits.py``, counted on the stand-in of `standin`.
+"""How often an accelerator keeps the host waiting, on the stand-in: ``python tests/helpers/waits.py``.
 
 A row is one workload, per pass, picture, call or training step. With ``--where``, the lines that wait most.
 """

@@ -1,4 +1,4 @@
-"""What a page draws against the tracer of this package: ``python tests/page_accuracy.py RUN [RUN …]``.
+"""What a page draws against the tracer of this package: ``python tests/helpers/page_accuracy.py RUN [RUN …]``.
 
 Each run is drawn by a headless Chromium and traced with the same rounded weights; then follow the costs of each level.
 """

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 OURS = tuple(f"{ROOT / name}/" for name in ("neural_fields", "datasets", "pipelines"))
 # Frames of these say nothing about who asked.
 UNDER = (f"{Path(torch.__file__).parent}/", f"{Path(__file__).parent}/")
