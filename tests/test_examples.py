@@ -18,7 +18,10 @@ import benchmarks
 from benchmarks.cli.entry import BENCHMARKS
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+DOCUMENTS = [
+    *(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "AGENTS")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
 PLUGIN = "mplicits.pipelines.nerfstudio."  # whose modules, but for the export, load where nerfstudio is installed only
 MODULES = [
     module.name

@@ -1,1 +1,1 @@
-"""What every run needs. Empty: the command line reads settings from here, and must not load torch for it."""
+"""Settings, trainer and run directory of every training. Empty, so that reading settings does not load torch."""
