@@ -13,7 +13,7 @@ from .fields.similarity import Similarity
 from .hosts.adapters import InstantNSRGeometry, NerfstudioField, NeuSGeometry
 from .meshing.extract import NoSurfaceError, extract_mesh
 from .meshing.mesh import Mesh
-from .networks.colors import TextureField, ViewColor
+from .networks.colors import ColorNetwork, TextureField
 from .networks.multiscale import MultiscaleSDF, fit_sphere
 from .networks.siren import Siren
 from .shape import WorldField
@@ -26,6 +26,7 @@ from .volume.render import render_volume
 __all__ = [
     "Box",
     "Capsule",
+    "ColorNetwork",
     "Difference",
     "Field",
     "FunctionField",
@@ -51,7 +52,6 @@ __all__ = [
     "TimeSlice",
     "Torus",
     "Union",
-    "ViewColor",
     "WorldField",
     "at_time",
     "extract_mesh",
@@ -77,7 +77,7 @@ _MOVED = {
     "meshing.extract": "map_normals",
     "fields.similarity": "Placement",
     "networks.encoded": "EncodedField",
-    "networks.colors": "ColorSiren Outside Radiance",
+    "networks.colors": "ColorSiren Outside=BackgroundField Radiance ViewColor=ColorNetwork",
     "networks.multiscale": "levels_of solve_sphere",
     "shape": "Closest WorldHits in_one_frame",
     "spacetime.evolution": "Law curvature key_loss law_loss mean_curvature morph near_surface normal_speed transport",

@@ -23,7 +23,7 @@ from .fields.csg import Bounded, Combined, Difference, Intersection, Offset, Pla
 from .fields.field import Field, plain
 from .fields.primitives import Box, Capsule, Plane, Sphere, Torus
 from .fields.similarity import Similarity
-from .networks.colors import ColorSiren, Outside, Radiance, TextureField, ViewColor
+from .networks.colors import BackgroundField, ColorNetwork, ColorSiren, Radiance, TextureField
 from .networks.encoded import EncodedField
 from .networks.grids import HashEncoding, grid_resolutions
 from .networks.multiscale import MultiscaleSDF
@@ -213,12 +213,12 @@ def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radian
         inv_std = float(header["inv_std"])
         if not 0 < inv_std < math.inf or tensors["background"].shape != (3,):
             raise ValueError(f"inv_std {inv_std:g}, background of shape {tuple(tensors['background'].shape)}")
-        color = _radiant(path, ViewColor, "color", header, tensors)
-        outside = None if header["outside"] is None else _radiant(path, Outside, "outside", header, tensors)
+        color = _radiant(path, ColorNetwork, "color", header, tensors)
+        outside = None if header["outside"] is None else _radiant(path, BackgroundField, "outside", header, tensors)
         return Radiance(color, outside, tensors["background"], inv_std), header["metadata"]
 
 
-def _radiant_of(network: ViewColor | Outside, sizes: Sequence[str]) -> dict[str, Any]:
+def _radiant_of(network: ColorNetwork | BackgroundField, sizes: Sequence[str]) -> dict[str, Any]:
     """Arguments of the network, from which `_radiant` makes it again."""
     grid = None if network.grid is None else _grid_of(network.grid)
     return {name: getattr(network, name) for name in sizes} | {"grid": grid}

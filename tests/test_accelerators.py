@@ -21,7 +21,7 @@ from mplicits.datasets.cameras import look_at
 from mplicits.datasets.clouds.cleaning.prepare import prepare_cloud
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_neus
-from mplicits.neural_fields.networks.colors import ViewColor
+from mplicits.neural_fields.networks.colors import ColorNetwork
 from mplicits.neural_fields.networks.multiscale import fit_sphere, solve_sphere
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
 from mplicits.neural_fields.tracing.cones import cone_ends, cone_starts
@@ -98,7 +98,7 @@ def meshed(device: torch.device) -> Result:
 
 def volume_rendered(device: torch.device) -> Result:
     field = small_multiscale(0.3)
-    color = ViewColor(field.base.num_features, width=16, depth=1)
+    color = ColorNetwork(field.base.num_features, width=16, depth=1)
     with torch.no_grad():
         field.deltas.mul_(0.1)
     field, color = field.to(device), color.to(device)
@@ -141,7 +141,7 @@ def in_instant_nsr(device: torch.device) -> Result:
 
 
 def in_nerfstudio(device: torch.device) -> Result:
-    host = nf.NerfstudioField(small_multiscale(0.5), ViewColor(2, width=16, depth=1), heads=Heads).to(device)
+    host = nf.NerfstudioField(small_multiscale(0.5), ColorNetwork(2, width=16, depth=1), heads=Heads).to(device)
     samples = ray_samples(torch.linspace(0.2, 1.8, 8).expand(6, 8))
     for name in ("origins", "directions", "starts"):
         setattr(samples.frustums, name, getattr(samples.frustums, name).to(device))

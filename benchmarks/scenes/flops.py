@@ -24,7 +24,7 @@ from typing import Any
 
 import torch
 from mplicits.neural_fields import Field, Jet
-from mplicits.neural_fields.networks.colors import Outside, ViewColor
+from mplicits.neural_fields.networks.colors import BackgroundField, ColorNetwork
 from mplicits.neural_fields.networks.multiscale import levels_of
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
 from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective, scene_trainer
@@ -299,14 +299,14 @@ def jet_flops(level: Field) -> float:
     return _flops(lambda: _go_back(level.jet(x)))
 
 
-def color_flops(color: ViewColor) -> float:
+def color_flops(color: ColorNetwork) -> float:
     """The same of one colour, whose cotangent goes on to the geometry."""
     color, x = copy.deepcopy(color), _points(color, 3)
     jet = Jet(x[:, 0], x.clone().requires_grad_(), _points(color, color.num_features).requires_grad_())
     return _flops(lambda: _go_back((color(x, x, jet),)))
 
 
-def outside_flops(outside: Outside) -> float:
+def outside_flops(outside: BackgroundField) -> float:
     """The same of density and colour of one point outside."""
     outside, x = copy.deepcopy(outside), _points(outside, 4)
     return _flops(lambda: _go_back(outside(x, x[:, :3])))

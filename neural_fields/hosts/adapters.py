@@ -197,7 +197,7 @@ class NerfstudioField(Hosted):
     Args:
         field: signed distance, negative inside.
         color: called as ``color(x, direction, jet)`` with ``(..., 3)``, ``(..., 3)`` and the field's `Jet` there, in
-            the host's units; returns RGB ``(..., 3)``. `ViewColor` is one.
+            the host's units; returns RGB ``(..., 3)``. `ColorNetwork` is one.
         heads: the host's ``FieldHeadNames``, whose members are the keys of the outputs.
         scale: points are multiplied by it, distances divided. By default 1, or with ``bounds`` what brings their
             farthest corner onto the field's unit sphere.

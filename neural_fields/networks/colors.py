@@ -34,10 +34,10 @@ def encoded_size(dim: int, frequencies: int) -> int:
     return dim * (1 + 2 * frequencies)
 
 
-class ViewColor(nn.Module):
-    """Colour of a surface point as seen along a direction: NeuS's c(x, v, ∇f/|∇f|, features).
+class ColorNetwork(nn.Module):
+    """Colour of a surface point from a viewing direction: NeuS's c(x, v, ∇f/|∇f|, features).
 
-    The geometry enters only through its `Jet`, so any field, at any level, will do.
+    The geometry enters only through its `Jet`, so any field works, at any level.
 
     Args:
         num_features: of the jet.
@@ -52,9 +52,9 @@ class ViewColor(nn.Module):
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import Siren, ViewColor
+        >>> from mplicits.neural_fields import ColorNetwork, Siren
         >>> jet = Siren(32, 2, num_features=8).jet(torch.zeros(5, 3))
-        >>> ViewColor(8, width=64)(torch.zeros(5, 3), torch.ones(5, 3), jet).shape
+        >>> ColorNetwork(8, width=64)(torch.zeros(5, 3), torch.ones(5, 3), jet).shape
         torch.Size([5, 3])
     """
 
@@ -83,7 +83,7 @@ class ViewColor(nn.Module):
 
         Args:
             x: ``(..., 3)`` points.
-            direction: ``(..., 3)`` unit vectors, from the eye to the points.
+            direction: ``(..., 3)`` unit vectors, from the camera to the points.
             jet: of the geometry there, with ``num_features`` features; ValueError otherwise.
         """
         if jet.features.shape[-1] != self.num_features:
@@ -95,7 +95,7 @@ class ViewColor(nn.Module):
         return _relu_network(torch.cat(inputs, dim=-1), self.layers).sigmoid()
 
 
-class Outside(nn.Module):
+class BackgroundField(nn.Module):
     """Density and colour outside the unit sphere, over (x/r, 1/r): the outer network of NeRF++.
 
     Args:
@@ -134,16 +134,16 @@ class Outside(nn.Module):
             inputs = torch.cat((inputs, self.grid(contracted)), dim=-1)
         hidden = _relu_network(inputs, self.trunk)
         density = nn.functional.softplus(hidden[..., 0] - 1)
-        seen = _relu_network(torch.cat((hidden[..., 1:], encode(direction, self.view_frequencies)), dim=-1), self.head)
-        return density, seen.sigmoid()
+        color = _relu_network(torch.cat((hidden[..., 1:], encode(direction, self.view_frequencies)), dim=-1), self.head)
+        return density, color.sigmoid()
 
 
 @dataclass(frozen=True, eq=False)
 class Radiance:
-    """All that `render_volume` needs beside a geometry."""
+    """Everything `render_volume` needs besides a geometry."""
 
-    color: ViewColor  # of the surface, by direction
-    outside: Outside | None  # field outside the unit sphere, or None
+    color: ColorNetwork  # of the surface, by direction
+    outside: BackgroundField | None  # field outside the unit sphere, or None
     background: Tensor  # (3,) display RGB in [0, 1] behind everything
     inv_std: float  # s of NeuS; 1/s is the uncertainty of the surface
 

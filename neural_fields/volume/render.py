@@ -150,7 +150,7 @@ def render_volume(
 
     Args:
         field: the geometry, in unit-sphere coordinates; or any function of points ``(..., 3)`` → ``(...,)``.
-        color: for example a `ViewColor`, or ``lambda x, v, jet: texture.colors(x)``.
+        color: for example a `ColorNetwork`, or ``lambda x, v, jet: texture.colors(x)``.
         origins: ``(R, 3)``.
         directions: ``(R, 3)`` unit vectors.
         inv_std: s of NeuS; 1/s is how far around the surface light is stopped.

@@ -21,7 +21,7 @@ from nerfstudio.models.neus import NeuSModel, NeuSModelConfig  # pyright: ignore
 from nerfstudio.models.neus_facto import NeuSFactoModel, NeuSFactoModelConfig  # pyright: ignore[reportMissingImports]
 from torch import Tensor, nn
 
-from ...neural_fields import MultiscaleSDF, NerfstudioField, Siren, ViewColor, fit_sphere
+from ...neural_fields import ColorNetwork, MultiscaleSDF, NerfstudioField, Siren, fit_sphere
 from ...neural_fields.hosts.learning_rates import HOST_RATE
 from ...neural_fields.networks.grids import HashEncoding, tables_apart
 from ..training.settings import ReconstructConfig
@@ -90,7 +90,7 @@ def build_field(config: MultiscaleFieldConfig, *, aabb: Tensor, **_: object) -> 
         residual_gain=0.01,
     )
     finest, extent = config.color_grid, float(aabb.abs().max())
-    color = ViewColor(
+    color = ColorNetwork(
         config.features,
         width=config.color_width,
         depth=config.color_depth,

@@ -14,7 +14,7 @@ from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
 from ...neural_fields.backend.devices import handed, precise
-from ...neural_fields.networks.colors import Outside, Radiance, ViewColor
+from ...neural_fields.networks.colors import BackgroundField, ColorNetwork, Radiance
 from ...neural_fields.networks.grids import HashEncoding
 from ...neural_fields.networks.multiscale import fit_sphere
 from ...neural_fields.networks.neus_mlp import NeusSDF
@@ -81,8 +81,8 @@ class SceneModel(nn.Module):
     def __init__(
         self,
         geometry: Field,
-        color: ViewColor,
-        outside: Outside | None,
+        color: ColorNetwork,
+        outside: BackgroundField | None,
         background: Tensor,
         exposures: Exposures | None = None,
         poses: PoseCorrections | None = None,
@@ -193,7 +193,7 @@ def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -
             assert isinstance(base, Siren)
             fit_sphere(base, config.radius)
         finest = config.color_grid
-        color = ViewColor(
+        color = ColorNetwork(
             features,
             width=config.color_width,
             depth=config.color_depth,
@@ -203,9 +203,9 @@ def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -
         outside = None
         if background == "outside" and finest:
             around = HashEncoding.up_to(finest, extent=2.0)
-            outside = Outside(width=64, depth=2, point_frequencies=4, grid=around)
+            outside = BackgroundField(width=64, depth=2, point_frequencies=4, grid=around)
         elif background == "outside":
-            outside = Outside()
+            outside = BackgroundField()
     exposures = Exposures(views) if config.exposure == "affine" else None
     poses = PoseCorrections(views) if config.cameras == "refined" else None
     return SceneModel(geometry, color, outside, torch.full((3,), float(background == "white")), exposures, poses)

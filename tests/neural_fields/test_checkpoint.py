@@ -12,7 +12,7 @@ import torch
 from fields import small_multiscale, small_spacetime
 from mplicits.neural_fields.checkpoint import load_radiance, save_radiance, save_texture
 from mplicits.neural_fields.fields.csg import Bounded, Placed
-from mplicits.neural_fields.networks.colors import ColorSiren, Outside, Radiance
+from mplicits.neural_fields.networks.colors import BackgroundField, ColorSiren, Radiance
 from mplicits.neural_fields.networks.grids import HashEncoding
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -94,9 +94,10 @@ def test_textures_survive_the_disk(tmp_path: Path, dtype: torch.dtype) -> None:
 def radiance(*, grid: bool = True, outside: bool = True) -> Radiance:
     table = {"levels": 3, "table_size": 64, "features": 2, "coarsest": 2, "finest": 9}
     torch.manual_seed(0)
-    color = nf.ViewColor(3, width=8, depth=1, point_frequencies=2, grid=HashEncoding(**table) if grid else None)
+    color = nf.ColorNetwork(3, width=8, depth=1, point_frequencies=2, grid=HashEncoding(**table) if grid else None)
     around = HashEncoding(**table, extent=2.0) if grid else None
-    behind = Outside(width=6, depth=2, point_frequencies=3, view_frequencies=2, grid=around) if outside else None
+    sizes = {"width": 6, "depth": 2, "point_frequencies": 3, "view_frequencies": 2}
+    behind = BackgroundField(**sizes, grid=around) if outside else None
     return Radiance(color, behind, torch.tensor([0.1, 0.2, 0.3]), 123.5)
 
 

@@ -9,7 +9,7 @@ import torch
 from evolutions import fails
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.neural_fields import Siren, Sphere, Union, extract_mesh
-from mplicits.neural_fields.networks.colors import Outside, ViewColor
+from mplicits.neural_fields.networks.colors import BackgroundField, ColorNetwork
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective, scene_trainer
@@ -51,9 +51,9 @@ def test_flops_of_one_row():
     assert flops.value_flops(level) == 2 * (3 * 16 + 16 * 16 + 16)  # the value alone needs no features
     # Six products with every weight, but the points have no cotangent, and features are not swept back.
     assert flops.jet_flops(level) == 2 * (5 * 3 * 16 + 6 * 16 * 16 + 3 * 16 * 5)
-    color = ViewColor(4, width=16, depth=2)
+    color = ColorNetwork(4, width=16, depth=2)
     assert flops.color_flops(color) == 6 * ((3 + 27 + 3 + 4) * 16 + 16 * 16 + 16 * 3)
-    outside = Outside(width=16, depth=1, point_frequencies=2, view_frequencies=1)
+    outside = BackgroundField(width=16, depth=1, point_frequencies=2, view_frequencies=1)
     weights = 20 * 16 + 16 * 17 + (16 + 9) * 8 + 8 * 3
     assert flops.outside_flops(outside) == 6 * weights - 2 * 20 * 16  # no cotangent of the points in the first layer
     neus = NeusSDF()

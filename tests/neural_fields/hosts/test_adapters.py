@@ -9,7 +9,7 @@ import torch
 from bounds import assert_within, rounding
 from fields import small_multiscale
 from hosts import Heads, NeuSHost, OldHeads, Separate, points, ray_samples, rays
-from mplicits.neural_fields.networks.colors import ViewColor
+from mplicits.neural_fields.networks.colors import ColorNetwork
 from mplicits.neural_fields.volume.weights import transmittance_weights
 from torch import Tensor, nn
 from torch.nn.functional import normalize, relu
@@ -168,7 +168,7 @@ def test_instant_nsr_mesh_is_in_the_hosts_units() -> None:
 
 def studio(heads: type[enum.Enum] = Heads) -> tuple[nf.NerfstudioField, Counted]:
     field = Counted(small_multiscale(0.5))
-    return nf.NerfstudioField(field, ViewColor(2, width=16, depth=1), heads=heads, deviation=0.3), field
+    return nf.NerfstudioField(field, ColorNetwork(2, width=16, depth=1), heads=heads, deviation=0.3), field
 
 
 def test_nerfstudio_step_costs_one_jet_per_sample() -> None:
@@ -229,7 +229,7 @@ def shells(field: nf.Field, **options: float) -> list:
     return [
         nf.NeuSGeometry(field, **options),
         nf.InstantNSRGeometry(field, **options),
-        nf.NerfstudioField(field, ViewColor(0, width=8, depth=1), heads=Heads, **options),
+        nf.NerfstudioField(field, ColorNetwork(0, width=8, depth=1), heads=Heads, **options),
     ]
 
 
@@ -249,7 +249,7 @@ def test_scale_comes_from_the_box() -> None:
     box = torch.tensor([[-1.0, -2.0, -2.0], [0.5, 1.0, 2.0]])
     for shell in (
         nf.NeuSGeometry(nf.Sphere(), bounds=box),
-        nf.NerfstudioField(nf.Sphere(), ViewColor(0, width=8, depth=1), heads=Heads, bounds=box),
+        nf.NerfstudioField(nf.Sphere(), ColorNetwork(0, width=8, depth=1), heads=Heads, bounds=box),
     ):
         assert shell.scale == pytest.approx(1 / 3, rel=1e-15)  # its farthest corner is (-1, -2, ±2)
         assert shell.bounds == ((-1.0, -2.0, -2.0), (0.5, 1.0, 2.0))

@@ -2,8 +2,8 @@ import pytest
 import torch
 from bounds import assert_within, rounding
 from fields import Watched, cube
-from mplicits.neural_fields import Field, MultiscaleSDF, Siren, Sphere, TextureField, Torus, ViewColor
-from mplicits.neural_fields.networks.colors import ColorSiren, Outside, encode, encoded_size
+from mplicits.neural_fields import ColorNetwork, Field, MultiscaleSDF, Siren, Sphere, TextureField, Torus
+from mplicits.neural_fields.networks.colors import BackgroundField, ColorSiren, encode, encoded_size
 from mplicits.neural_fields.networks.grids import HashEncoding
 from torch import Tensor
 
@@ -166,7 +166,7 @@ def test_encoding_is_octaves_of_sines_and_cosines() -> None:
 
 
 def test_colors_are_between_0_and_1_for_any_leading_shape() -> None:
-    color = ViewColor(0, width=16, depth=2)
+    color = ColorNetwork(0, width=16, depth=2)
     x = torch.randn(4, 5, 3)
     seen = color(x, torch.nn.functional.normalize(x, dim=-1), Sphere().jet(x))
     assert seen.shape == (4, 5, 3)
@@ -174,7 +174,7 @@ def test_colors_are_between_0_and_1_for_any_leading_shape() -> None:
 
 
 def test_colour_depends_on_the_direction_and_on_the_normal_but_not_on_the_gradients_length() -> None:
-    color = ViewColor(0, width=32, depth=2).double()
+    color = ColorNetwork(0, width=32, depth=2).double()
     x = torch.randn(6, 3, dtype=torch.float64)
     along = torch.nn.functional.normalize(torch.randn(6, 3, dtype=torch.float64), dim=-1)
     jet = Sphere(radius=0.5).double().jet(x)
@@ -185,23 +185,23 @@ def test_colour_depends_on_the_direction_and_on_the_normal_but_not_on_the_gradie
 
 
 def test_a_grid_is_trained_where_it_is_looked_up_and_moves_with_the_colours(device: torch.device) -> None:
-    color = ViewColor(0, width=16, depth=1, grid=HashEncoding(levels=2, coarsest=8, finest=16)).to(device)
+    color = ColorNetwork(0, width=16, depth=1, grid=HashEncoding(levels=2, coarsest=8, finest=16)).to(device)
     x = torch.full((1, 3), 0.1, device=device)
     color(x, x, Sphere().to(device).jet(x)).sum().backward()
     assert int((color.grid.table.grad != 0).any(dim=1).sum()) == 2 * 8  # the corners of a cell of each level
 
 
-def test_outside_gives_density_and_colour() -> None:
-    density, seen = Outside(width=16, depth=2)(torch.randn(7, 4), torch.randn(7, 3))
+def test_background_field_returns_density_and_colour() -> None:
+    density, color = BackgroundField(width=16, depth=2)(torch.randn(7, 4), torch.randn(7, 3))
     assert density.shape == (7,)
-    assert seen.shape == (7, 3)
+    assert color.shape == (7, 3)
     assert bool((density > 0).all())
 
 
-def test_outside_looks_its_grid_up_where_space_is_contracted_to() -> None:
-    outside = Outside(width=8, depth=1, grid=HashEncoding(levels=1, coarsest=4, finest=4, extent=2.0))
+def test_background_field_evaluates_its_grid_at_contracted_points() -> None:
+    outside = BackgroundField(width=8, depth=1, grid=HashEncoding(levels=1, coarsest=4, finest=4, extent=2.0))
     far = torch.tensor([[0.0, 0.0, 1.0, 0.0]])  # infinitely far along z: the pole of the ball of radius 2
-    density, seen = outside(far, far[:, :3])
-    (density.sum() + seen.sum()).backward()
+    density, color = outside(far, far[:, :3])
+    (density.sum() + color.sum()).backward()
     touched = outside.grid.table.grad.any(dim=1).nonzero()[:, 0].tolist()
     assert touched == [(2 * 5 + 2) * 5 + 4]  # the vertex at (0, 0, 2) of 5³

@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 import torch
 from fields import FIELDS
-from mplicits.neural_fields import Jet, MultiscaleSDF, Plane, Siren, Sphere, ViewColor, render_volume
+from mplicits.neural_fields import ColorNetwork, Jet, MultiscaleSDF, Plane, Siren, Sphere, render_volume
 from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
 from mplicits.neural_fields.fields.field import as_field
-from mplicits.neural_fields.networks.colors import Outside
+from mplicits.neural_fields.networks.colors import BackgroundField
 from mplicits.neural_fields.networks.grids import ValueGrid
 from mplicits.neural_fields.volume.render import Rendered, Samples, Sampling, render_samples, sample_depths, sample_rays
 from mplicits.neural_fields.volume.weights import sphere_span
@@ -75,7 +75,7 @@ def test_agrees_with_a_loop_over_rays_and_samples() -> None:
 def test_every_field_renders_and_trains(name: str) -> None:
     field = FIELDS[name]()
     features = field.jet(torch.zeros(1, 3)).features.shape[-1]
-    color, inv_std = ViewColor(features, width=16, depth=1), torch.tensor(20.0, requires_grad=True)
+    color, inv_std = ColorNetwork(features, width=16, depth=1), torch.tensor(20.0, requires_grad=True)
     sampling = Sampling(uniform=8, importance=4, rounds=2)
     seen = render_volume(field, color, *rays(6), inv_std=inv_std, sampling=sampling)
     assert seen.color.shape == (6, 3)
@@ -94,7 +94,7 @@ def test_no_rays_are_legal() -> None:
 def test_in_fixed_shapes_rays_see_the_same_if_there_is_room(spare: int | None) -> None:
     torch.manual_seed(0)
     field = MultiscaleSDF.from_widths([(16, 1), (16, 1)], omegas=[4, 8], deltas=[0.02], taper=0.5, num_features=3)
-    color, around = ViewColor(3, width=8, depth=1), Outside(width=8, depth=1)
+    color, around = ColorNetwork(3, width=8, depth=1), BackgroundField(width=8, depth=1)
     field, color, around = field.double(), color.double(), around.double()
     parameters = [*field.parameters(), *color.parameters(), *around.parameters()]
     origins, directions = (part.double() for part in rays(40))

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from mplicits.neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError, Sphere, ViewColor
+from mplicits.neural_fields import ColorNetwork, InputError, Mesh, NerfstudioField, NoSurfaceError, Sphere
 from mplicits.pipelines.nerfstudio.export import export_mesh, host_cameras, in_data_coordinates, main, part_seen
 from mplicits.pipelines.surface.surface import read_surface
 from nerfstudio_stand_in import PLUGIN, Heads, stand_in
@@ -204,7 +204,7 @@ def test_bad_exports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: py
         export_mesh(config, tmp_path / "mesh.ply")
     with pytest.raises(InputError, match="unknown mesh format"):  # said before the training is read, which is none
         export_mesh(config, tmp_path / "mesh.png")
-    away = NerfstudioField(Sphere(radius=3.0), ViewColor(0, width=8, depth=1), heads=Heads)
+    away = NerfstudioField(Sphere(radius=3.0), ColorNetwork(0, width=8, depth=1), heads=Heads)
     exported(monkeypatch, tmp_path, away)
     words = ["--load-config", str(config), "--output-path", str(tmp_path / "mesh.ply"), "--resolution", "8"]
     assert main(words) == 2

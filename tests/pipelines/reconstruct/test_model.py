@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import PosedImage, look_at
-from mplicits.neural_fields import InputError, Similarity, Sphere, ViewColor
+from mplicits.neural_fields import ColorNetwork, InputError, Similarity, Sphere
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.neural_fields.volume.weights import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
@@ -25,7 +25,7 @@ def no_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_uncertainty_begins_as_in_neus_and_can_be_trained() -> None:
-    model = SceneModel(Sphere(radius=0.5), ViewColor(0, width=8, depth=1), None, torch.zeros(3))
+    model = SceneModel(Sphere(radius=0.5), ColorNetwork(0, width=8, depth=1), None, torch.zeros(3))
     assert float(model.inv_std.detach()) == pytest.approx(math.exp(3), rel=1e-6)
     (slope,) = torch.autograd.grad(model.inv_std, model.variance)
     assert float(slope) == pytest.approx(10 * math.exp(3), rel=1e-5)

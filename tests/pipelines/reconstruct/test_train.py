@@ -16,7 +16,7 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene, sample_scen
 from mplicits.datasets.synthetic.view_faults import with_fault
 from mplicits.datasets.views.images import PosedImage, PosedImages
 from mplicits.datasets.views.writing import write_neus, write_transforms
-from mplicits.neural_fields import InputError, Similarity, Sphere, ViewColor, extract_mesh, load_field
+from mplicits.neural_fields import ColorNetwork, InputError, Similarity, Sphere, extract_mesh, load_field
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.reconstruct import hull
@@ -316,7 +316,7 @@ def test_a_budget_counts_all_but_leaves_most_for_the_training(data: Path, tmp_pa
     assert record["texture"]["budget"]["seconds"] < 2.0
 
 
-class Glossy(ViewColor):
+class Glossy(ColorNetwork):
     """Paint of 0.3 + 0.4 x, under a lamp that is reflected."""
 
     def forward(self, x: Tensor, direction: Tensor, jet: Any) -> Tensor:
@@ -342,7 +342,7 @@ def test_colours_of_the_surface_are_without_highlights() -> None:
 
 
 def test_the_colour_is_the_lower_quartile_of_those_that_face_a_point() -> None:
-    class Direction(ViewColor):
+    class Direction(ColorNetwork):
         """Everything is coloured by where it is seen from."""
 
         def forward(self, x: Tensor, direction: Tensor, jet: Any) -> Tensor:
