@@ -20,30 +20,30 @@ class FixedShapes:
 
     Attributes:
         capacity: rows for each residual level, coarse to fine; None, and levels beyond the last: all rows.
-        wanted: ``(N,)`` bool, points whose values are used; None for all. Others get a coarse value.
-        demand: per residual level, the largest number of points in its band so far, 0-d int64.
-        lost: ``(N,)`` bool of the last evaluation: points that overflowed a band, and have a coarser level's value; or
-            None.
-        rooms: capacity of each choice by `chosen`; without a name here, all rows.
-        asked: by the same names, how many rows were to be chosen, 0-d int64.
+        mask: ``(N,)`` bool, points whose values are used; None for all. Others get a coarse value.
+        requested: per residual level, the largest number of points in its band so far, 0-d int64.
+        overflow: ``(N,)`` bool of the last evaluation, or None: points that exceeded a band's capacity, and have a
+            coarser level's value.
+        named_capacity: capacity of each selection by `chosen`; without a name here, all rows.
+        named_requested: by the same names, how many rows were to be chosen, 0-d int64.
     """
 
     def __init__(
         self,
         capacity: Sequence[int] | None = None,
-        wanted: Tensor | None = None,
-        rooms: Mapping[str, int] = MappingProxyType({}),
+        mask: Tensor | None = None,
+        named_capacity: Mapping[str, int] = MappingProxyType({}),
     ) -> None:
-        self.capacity, self.wanted, self.rooms = capacity, wanted, rooms
-        self.demand: list[Tensor] = []
-        self.asked: dict[str, Tensor] = {}
-        self.lost: Tensor | None = None
+        self.capacity, self.mask, self.named_capacity = capacity, mask, named_capacity
+        self.requested: list[Tensor] = []
+        self.named_requested: dict[str, Tensor] = {}
+        self.overflow: Tensor | None = None
         self._under_way = False
 
     def begin(self) -> None:
-        """Reset ``lost`` at the start of an evaluation that is not part of another."""
+        """Reset ``overflow`` at the start of an evaluation that is not part of another."""
         if not self._under_way:
-            self.lost = None
+            self.overflow = None
 
     @contextmanager
     def whole(self) -> Iterator[None]:
@@ -62,17 +62,17 @@ class FixedShapes:
         suffices for all, so that every point may be evaluated in place.
         """
         count = inside.sum()
-        if index < len(self.demand):
-            self.demand[index] = torch.maximum(self.demand[index], count)
+        if index < len(self.requested):
+            self.requested[index] = torch.maximum(self.requested[index], count)
         else:
-            self.demand.append(count)
-        room = len(inside) if self.capacity is None or index >= len(self.capacity) else self.capacity[index]
-        if room >= len(inside):
+            self.requested.append(count)
+        capacity = len(inside) if self.capacity is None or index >= len(self.capacity) else self.capacity[index]
+        if capacity >= len(inside):
             return inside, None
-        admitted = inside & (inside.cumsum(0) <= room)
-        turned_away = inside & ~admitted
-        self.lost = turned_away if self.lost is None else self.lost | turned_away
-        return admitted, first_rows(admitted, room)
+        admitted = inside & (inside.cumsum(0) <= capacity)
+        rejected = inside & ~admitted
+        self.overflow = rejected if self.overflow is None else self.overflow | rejected
+        return admitted, first_rows(admitted, capacity)
 
 
 class Rows(NamedTuple):
@@ -86,10 +86,10 @@ class Rows(NamedTuple):
         """``(N, …)`` → ``(K, …)``; surplus places get the last row."""
         return tensor[self.places] if self.full else tensor.index_select(0, self.places.clamp(max=self.total - 1))
 
-    def back(self, found: Tensor) -> Tensor:
+    def back(self, values: Tensor) -> Tensor:
         """``(K, …)`` → ``(N, …)``, 0 in rows that were not chosen."""
-        blank = found.new_zeros(self.total if self.full else self.total + 1, *found.shape[1:])
-        filled = blank.index_copy(0, self.places, found)
+        blank = values.new_zeros(self.total if self.full else self.total + 1, *values.shape[1:])
+        filled = blank.index_copy(0, self.places, values)
         return filled if self.full else filled[: self.total]
 
     @property
@@ -98,17 +98,17 @@ class Rows(NamedTuple):
         return self.places < self.total
 
     @contextmanager
-    def wanted(self) -> Iterator[None]:
+    def masked(self) -> Iterator[None]:
         """Inside this, fields admit no surplus place to a band."""
         shapes = current_shapes()
         if shapes is None or self.full:
             yield
             return
-        before, shapes.wanted = shapes.wanted, self.used
+        before, shapes.mask = shapes.mask, self.used
         try:
             yield
         finally:
-            shapes.wanted = before
+            shapes.mask = before
 
 
 def chosen(name: str, mask: Tensor) -> Rows:
@@ -116,9 +116,9 @@ def chosen(name: str, mask: Tensor) -> Rows:
     shapes = current_shapes()
     if shapes is None:
         return Rows(mask.nonzero()[:, 0], len(mask), full=True)
-    shapes.asked[name] = mask.sum()
-    room = min(shapes.rooms.get(name, len(mask)), len(mask))
-    return Rows(first_rows(mask, room), len(mask), full=False)
+    shapes.named_requested[name] = mask.sum()
+    capacity = min(shapes.named_capacity.get(name, len(mask)), len(mask))
+    return Rows(first_rows(mask, capacity), len(mask), full=False)
 
 
 _shapes: ContextVar[FixedShapes | None] = ContextVar("shapes", default=None)
@@ -126,14 +126,14 @@ _shapes: ContextVar[FixedShapes | None] = ContextVar("shapes", default=None)
 
 @contextmanager
 def fixed_shapes(
-    capacity: Sequence[int] | None = None, *, rooms: Mapping[str, int] = MappingProxyType({})
+    capacity: Sequence[int] | None = None, *, named_capacity: Mapping[str, int] = MappingProxyType({})
 ) -> Iterator[FixedShapes]:
     """Inside this, a `MultiscaleSDF` never makes the host wait, and launches the same kernels for any points.
 
     Without a ``capacity`` every level is evaluated at every point, and used in its band. Results are equal but for
-    rounding. With capacities, check ``lost``. The arguments are those of `FixedShapes`.
+    rounding. With capacities, check ``overflow``. The arguments are those of `FixedShapes`.
     """
-    shapes = FixedShapes(capacity, rooms=rooms)
+    shapes = FixedShapes(capacity, named_capacity=named_capacity)
     token = _shapes.set(shapes)
     try:
         yield shapes

@@ -140,7 +140,7 @@ class MultiscaleSDF(Field):
             from ..backend.kernels.levels import levels_value
 
             rows = self.check_points(x).reshape(-1, self.in_dim)
-            return levels_value(rows, as_levels(self, level), _wanted()).reshape(x.shape[:-1])
+            return levels_value(rows, as_levels(self, level), _mask()).reshape(x.shape[:-1])
         (f,) = deque(self._walk(x, level, _value), maxlen=1).pop()
         return f
 
@@ -163,7 +163,7 @@ class MultiscaleSDF(Field):
             from ..backend.kernels.levels import levels_jet
 
             rows, shape = self.check_points(x).reshape(-1, self.in_dim), x.shape[:-1]
-            value, gradient = levels_jet(rows, as_levels(self, level), _wanted())
+            value, gradient = levels_jet(rows, as_levels(self, level), _mask())
             return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
         return Jet(*deque(self._walk(x, level, lambda part, points: part.jet(points)), maxlen=1).pop())
 
@@ -310,7 +310,7 @@ def _walk_on(
     """The walk from the base on inside `fixed_shapes`."""
     shapes.begin()
     count = len(points)
-    inside = torch.ones_like(parts[0], dtype=torch.bool) if shapes.wanted is None else shapes.wanted
+    inside = torch.ones_like(parts[0], dtype=torch.bool) if shapes.mask is None else shapes.mask
     for index, (level, delta) in enumerate(zip(residuals, deltas, strict=False)):
         inside, rows = shapes.admit(index, inside & (parts[0].abs() < delta))
         if rows is None:
@@ -332,13 +332,13 @@ def _where(inside: Tensor, new: Parts, old: Parts) -> Parts:
     return tuple(torch.where(inside.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs)
 
 
-def _wanted() -> Tensor | None:
-    """The points that are admitted to bands inside `fixed_shapes`; one launch has capacity for all of them."""
+def _mask() -> Tensor | None:
+    """The mask of points that bands admit inside `fixed_shapes`; one launch has capacity for all of them."""
     shapes = current_shapes()
     if shapes is None:
         return None
     shapes.begin()
-    return shapes.wanted
+    return shapes.mask
 
 
 def _value(level: Field, points: Tensor) -> Parts:

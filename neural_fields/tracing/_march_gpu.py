@@ -16,8 +16,8 @@ from ..fields.field import Field
 from ._march import PATIENCE, Found, Rays, Rule, Stand, look
 
 FIRST_PASSES, PASSES = 8, 16  # before the first look, when many rays end, and between later ones
-FEW, SHARE = 4096, 0.25  # first capacity of a band: for all of a few rays, for a share of many
-SPARE, LEAST_ROOM = 1.25, 256  # later capacity: factor on the last demand, and the least
+FEW, SHARE = 4096, 0.25  # first capacity of a band: this many rows, or this share of the rays if that is more
+SPARE, LEAST_CAPACITY = 1.25, 256  # later capacity: factor on the rows last requested, and the least
 
 
 def march_ahead(
@@ -29,11 +29,11 @@ def march_ahead(
     passes = FIRST_PASSES
     while len(rays.ray) and max_steps > 0:
         chunk = _Chunk(field, level, rays, count, rule, max_steps)
-        demand = chunk.run(passes, found, reach, capacity)
-        left, *asked = torch.stack([(~chunk.ended).sum(), *demand]).tolist()  # the host waits here, and nowhere else
+        requested = chunk.run(passes, found, reach, capacity)
+        left, *counts = torch.stack([(~chunk.ended).sum(), *requested]).tolist()  # the only wait of the host
         rows = first_rows(~chunk.ended, left)
         rays, count = chunk.rays.only(rows), chunk.count[rows]
-        capacity = [max(LEAST_ROOM, int(SPARE * number)) for number in asked]
+        capacity = [max(LEAST_CAPACITY, int(SPARE * number)) for number in counts]
         passes = PASSES
 
 
@@ -55,22 +55,22 @@ class _Chunk:
 
     def run(self, passes: int, found: Found, reach: float | None, capacity: Sequence[int]) -> list[Tensor]:
         """Do ``passes`` passes, record the rays that ended, and return the requested capacity of each band."""
-        demand: list[Tensor] = []
+        requested: list[Tensor] = []
         if self.field.same_rows:
             with fixed_shapes(capacity) as shapes:
                 for _ in range(passes):
-                    shapes.wanted = ~self.ended
+                    shapes.mask = ~self.ended
                     value = self._values()
                     self._pass(
-                        value, shapes.wanted if shapes.lost is None else shapes.wanted & ~shapes.lost, found, reach
+                        value, shapes.mask if shapes.overflow is None else shapes.mask & ~shapes.overflow, found, reach
                     )
-            demand = shapes.demand
+            requested = shapes.requested
         else:  # a field that is evaluated at other rows could not tell which rows overflow
             for _ in range(passes):
                 self._pass(self._values(), ~self.ended, found, reach)
         stand = self.stand
         found.record(self.rays.ray, stand.hit, stand.depth, stand.level, self.count, stand.slope)
-        return demand
+        return requested
 
     def _values(self) -> Tensor:
         return self.field.value(self.rays.points(), level=self.level)

@@ -64,7 +64,7 @@ def cone_ends(
     field: FieldLike,
     origin: Tensor,
     directions: Tensor,
-    wanted: Tensor,
+    mask: Tensor,
     *,
     level: int = -1,
     tiles: Sequence[int] = (32, 8),
@@ -76,7 +76,7 @@ def cone_ends(
     """Depths ``(H, W)`` from which on whole tiles of an image are empty, for ``far`` of `sphere_trace`.
 
     As `cone_starts`, from behind: with v = |f_0| at depth t on the axis, the tile is empty from (t − (v − δ_0)/L) / (1
-    − σ) on. Tiles without a pixel of ``wanted`` ``(H, W)`` are left out, with infinite depths.
+    − σ) on. Tiles without a pixel of the ``mask`` ``(H, W)`` are left out, with infinite depths.
     """
     field = as_field(field)
     level = field.resolve_level(level)
@@ -95,13 +95,13 @@ def cone_ends(
 
     for tile in tiles:
         cones = _Cones.of(directions, tile)
-        asked = wanted.new_zeros(len(cones.axis), dtype=torch.uint8)
-        asked = asked.scatter_reduce(0, cones.of_pixel.flatten(), wanted.flatten().to(torch.uint8), "amax").bool()
+        marched = mask.new_zeros(len(cones.axis), dtype=torch.uint8)
+        marched = marched.scatter_reduce(0, cones.of_pixel.flatten(), mask.flatten().to(torch.uint8), "amax").bool()
         entry, leave = ball_crossing(origin.expand_as(cones.axis), cones.axis, radius + cones.spread * reach)
         ends = torch.minimum(depth[::tile, ::tile].reshape(-1), leave / (1 - cones.spread))
         fixed = (cones.axis, cones.spread, entry)
-        (ends,) = _until_all_stop(fixed, (ends,), asked & (ends > entry), advance, max_steps)
-        depth = torch.where(asked, ends, torch.inf)[cones.of_pixel]
+        (ends,) = _until_all_stop(fixed, (ends,), marched & (ends > entry), advance, max_steps)
+        depth = torch.where(marched, ends, torch.inf)[cones.of_pixel]
     return depth / length
 
 

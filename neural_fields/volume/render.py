@@ -274,7 +274,7 @@ def render_samples(
 
     points = gathered(ray_points(origins, directions, depths))  # (K, 3)
     along = gathered(directions[:, None].expand(-1, depths.shape[1], -1))
-    with nullcontext() if rows is None else rows.wanted():
+    with nullcontext() if rows is None else rows.masked():
         found = field.jet(points, level=level)
     slope = (found.gradient * along).sum(dim=-1)
     optical = neus_optical_depth(found.value, slope, gathered(interval), inv_std, cos_anneal=cos_anneal)

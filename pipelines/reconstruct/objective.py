@@ -243,7 +243,7 @@ CHOICES = ("sections", "colors", "outside")
 
 @dataclass(frozen=True)
 class Capacity:
-    """How many rows a recorded step has room for: for n requested, ``spare`` n + ``more``, in multiples of ``step``."""
+    """Rows reserved for a recorded step: ``spare`` n + ``more`` for n requested, in multiples of ``step``."""
 
     spare: float = 1.25
     more: int = 64
@@ -252,17 +252,17 @@ class Capacity:
     empty: float = 0.5  # share of the capacity below which a new one has to lie to replace it
     ray_counts: int = 8  # numbers of rays are multiples of this share of the most, 1 / ``ray_counts``
 
-    def of(self, need: float) -> int:
+    def of(self, requested: float) -> int:
         """Rows to reserve."""
-        return self.step * math.ceil((self.spare * need + self.more) / self.step)
+        return self.step * math.ceil((self.spare * requested + self.more) / self.step)
 
-    def suits(self, room: int, need: float) -> bool:
-        """Whether reserved rows are neither too few for what is requested now, nor far too many."""
-        return need <= self.full * room and self.of(need) >= self.empty * room
+    def suits(self, capacity: int, requested: float) -> bool:
+        """Whether the capacity is neither too small for the rows requested now, nor far too large."""
+        return requested <= self.full * capacity and self.of(requested) >= self.empty * capacity
 
 
-# How many rows each of the CHOICES of a step has room for, and then each band; None for all.
-Rooms = tuple[int, ...] | None
+# The capacity of each of the CHOICES of a step, then of each band; None for all rows.
+Capacities = tuple[int, ...] | None
 
 
 class ReplayedTrainer(Trainer[SceneObjective]):
@@ -283,9 +283,9 @@ class ReplayedTrainer(Trainer[SceneObjective]):
             group["capturable"] = device.type == "cuda"
         # The most rows requested lately, of CHOICES and residual levels; and the number of steps not taken.
         self.peaks = torch.zeros(len(CHOICES) + len(objective.model.geometry.deltas) + 1, device=device)
-        self.rooms: dict[Kind, tuple[int, ...]] = {}
-        self.asked: dict[int, list[float]] = {}  # by the level that is on: what a ray asked for, at most
-        self.left_out = 0
+        self.capacities: dict[Kind, tuple[int, ...]] = {}
+        self.requested: dict[int, list[float]] = {}  # by the finest level switched on: rows per ray, at most
+        self.not_taken = 0
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """See `Trainer.restore`; what was recorded is forgotten, because it is about other memory."""
@@ -295,24 +295,24 @@ class ReplayedTrainer(Trainer[SceneObjective]):
     def facts(self) -> dict[str, Any]:
         """Kinds of steps that were recorded, steps that were not taken, and why nothing is recorded, if so."""
         refused = {"refused": self.replays.refused} if self.replays.refused else {}
-        return {"recorded": self.replays.recorded, "not_taken": self.left_out, **refused}
+        return {"recorded": self.replays.recorded, "not_taken": self.not_taken, **refused}
 
     def _step(self) -> dict[str, Tensor]:
         kind = self.objective.ahead(self.step, self.fraction)
         part = math.ceil(self.objective.config.rays / self.capacity.ray_counts)
         kind = kind._replace(rays=math.ceil(kind.rays / part) * part)
-        rooms = self._rooms(kind)
-        found = dict(self.replays.do((kind, rooms), lambda: self._work(kind, rooms)))
+        capacities = self._capacities(kind)
+        terms = dict(self.replays.do((kind, capacities), lambda: self._work(kind, capacities)))
         # A replay changes parameters behind PyTorch's back; the fused kernels pack them again by their versions.
         torch.autograd.graph.increment_version(self.trained)
-        sections = found.pop("sections")
+        sections = terms.pop("sections")
         self.objective.behind(self.step, sections)
         self.step += 1
         if self.step % self.objective.schedule.near_every == 0:
-            self._learn(kind)
-        return found
+            self._read_requested(kind)
+        return terms
 
-    def _work(self, kind: Kind, rooms: Rooms) -> dict[str, Tensor]:
+    def _work(self, kind: Kind, capacities: Capacities) -> dict[str, Tensor]:
         """A step as the device does it."""
         objective = self.objective
         rates = handed(
@@ -320,41 +320,43 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         )
         for group, rate in zip(self.adam.param_groups, rates.unbind(), strict=True):
             group["lr"] = rate
-        given = rooms or ()
-        with fixed_shapes(given[len(CHOICES) :], rooms=dict(zip(CHOICES, given, strict=False))) as shapes:
+        given = capacities or ()
+        named = dict(zip(CHOICES, given, strict=False))
+        with fixed_shapes(given[len(CHOICES) :], named_capacity=named) as shapes:
             outcome = objective.evaluate(kind)
         with torch.no_grad():
-            asked = self._asked(shapes)
-            over = [asked[row] > room for row, room in enumerate(given)]
-            lost = torch.stack(over).any().float() if over else asked.new_zeros(())
-            self.peaks[: len(asked)] = torch.maximum(self.peaks[: len(asked)], asked)
-            self.peaks[-1] += lost
-        self.adam.found_inf = lost  # pyright: ignore[reportAttributeAccessIssue]  of a step that is not taken it is 1
+            requested = self._requested(shapes)
+            over = [requested[row] > capacity for row, capacity in enumerate(given)]
+            overflow = torch.stack(over).any().float() if over else requested.new_zeros(())
+            self.peaks[: len(requested)] = torch.maximum(self.peaks[: len(requested)], requested)
+            self.peaks[-1] += overflow
+        self.adam.found_inf = overflow  # pyright: ignore[reportAttributeAccessIssue]  of a step that is not taken it is 1
         self.descend(outcome.total)
         terms = {name: term.detach() for name, term in outcome.terms.items()}
         return terms | {"sections": outcome.sections}
 
-    def _asked(self, shapes: FixedShapes) -> Tensor:
+    def _requested(self, shapes: FixedShapes) -> Tensor:
         """How many rows were to be chosen, of `CHOICES` and in each band."""
         none = self.peaks.new_zeros(())
-        bands = [*shapes.demand, *[none] * (len(self.peaks) - 1 - len(CHOICES) - len(shapes.demand))]
-        return torch.stack([part.to(none) for part in [shapes.asked.get(name, none) for name in CHOICES] + bands])
+        bands = [*shapes.requested, *[none] * (len(self.peaks) - 1 - len(CHOICES) - len(shapes.requested))]
+        named = [shapes.named_requested.get(name, none) for name in CHOICES]
+        return torch.stack([part.to(none) for part in named + bands])
 
-    def _rooms(self, kind: Kind) -> Rooms:
-        """The rooms of a kind of step: those that it has, as long as they hold the rows requested."""
-        old, asked = self.rooms.get(kind), self.asked.get(kind.level)
-        if asked is None:
+    def _capacities(self, kind: Kind) -> Capacities:
+        """The capacities of a kind of step: the present ones, as long as they suit the rows requested."""
+        old, per_ray = self.capacities.get(kind), self.requested.get(kind.level)
+        if per_ray is None:
             return old
-        wanted = [kind.rays * each for each in asked]
-        if old is None or not all(map(self.capacity.suits, old, wanted)):
-            self.rooms[kind] = tuple(map(self.capacity.of, wanted))
-        return self.rooms[kind]
+        requested = [kind.rays * each for each in per_ray]
+        if old is None or not all(map(self.capacity.suits, old, requested)):
+            self.capacities[kind] = tuple(map(self.capacity.of, requested))
+        return self.capacities[kind]
 
-    def _learn(self, kind: Kind) -> None:
-        """Look at the rows requested in the last steps."""
-        *peaks, lost = self.peaks.tolist()
-        self.asked[kind.level] = [peak / kind.rays for peak in peaks]
-        self.left_out += int(lost)
+    def _read_requested(self, kind: Kind) -> None:
+        """Read from the device how many rows the last steps requested."""
+        *peaks, overflows = self.peaks.tolist()
+        self.requested[kind.level] = [peak / kind.rays for peak in peaks]
+        self.not_taken += int(overflows)
         self.peaks.zero_()
 
 

@@ -96,16 +96,16 @@ def append(entries, length, entry, chosen):
     return length + tl.sum(chosen.to(tl.int32), axis=0)
 
 
-@triton.jit(do_not_specialize=["room"])
+@triton.jit(do_not_specialize=["capacity"])
 def walk(
-    x, wanted, floats, halves, deltas, value, gradient, lists, scratch, counted, room, taper,
-    JET: tl.constexpr, WANTED: tl.constexpr, TAPERED: tl.constexpr, SHAPES: tl.constexpr, SCRATCH: tl.constexpr,
+    x, row_mask, floats, halves, deltas, value, gradient, lists, scratch, counted, capacity, taper,
+    JET: tl.constexpr, MASKED: tl.constexpr, TAPERED: tl.constexpr, SHAPES: tl.constexpr, SCRATCH: tl.constexpr,
     ROWS: tl.constexpr, IN: tl.constexpr,
 ):  # fmt: skip
-    """Every program takes tiles from its own number on, and has a list with ``room`` for all their rows."""
+    """Every program takes tiles from its own number on, and has a list whose ``capacity`` holds all their rows."""
     LEVELS: tl.constexpr = len(SHAPES)
     program = tl.cast(tl.program_id(0), tl.int64)
-    own, listed = scratch + program * SCRATCH, lists + program * room
+    own, listed = scratch + program * SCRATCH, lists + program * capacity
     length = tl.full((), 0, tl.int32)
     count = tl.load(counted)
     for tile in range(tl.program_id(0), tl.cdiv(count, ROWS), tl.num_programs(0)):
@@ -119,8 +119,8 @@ def walk(
                 tl.store(gradient + row * IN + axis, slope[axis], mask=real)
         if LEVELS > 1:
             inside = real & (tl.abs(f) < tl.load(deltas))
-            if WANTED:
-                inside = inside & (tl.load(wanted + row, mask=real, other=0) != 0)
+            if MASKED:
+                inside = inside & (tl.load(row_mask + row, mask=real, other=0) != 0)
             length = append(listed, length, row, inside)
 
     for level in tl.static_range(1, LEVELS):
@@ -150,17 +150,17 @@ def walk(
             done += ROWS
 
 
-def levels_value(x: Tensor, levels: Levels, wanted: Tensor | None = None) -> Tensor:
-    """The finest of two or more levels at float32 points ``(N, d)`` → ``(N,)``; bands admit ``wanted`` only."""
+def levels_value(x: Tensor, levels: Levels, mask: Tensor | None = None) -> Tensor:
+    """The finest of two or more levels at float32 points ``(N, d)`` → ``(N,)``; bands admit ``mask`` only."""
     value = x.new_empty(len(x))
-    walk_rows(x, levels, value, value, wanted, jet=False)
+    walk_rows(x, levels, value, value, mask, jet=False)
     return value
 
 
-def levels_jet(x: Tensor, levels: Levels, wanted: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def levels_jet(x: Tensor, levels: Levels, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The finest level and its gradient at ``(N, d)`` → ``(N,)``, ``(N, d)``; see `levels_value`."""
     value, gradient = x.new_empty(len(x)), x.new_empty(x.shape)
-    walk_rows(x, levels, value, gradient, wanted, jet=True)
+    walk_rows(x, levels, value, gradient, mask, jet=True)
     return value, gradient
 
 
@@ -169,7 +169,7 @@ def walk_rows(
     levels: Levels,
     value: Tensor,
     gradient: Tensor,
-    wanted: Tensor | None = None,
+    mask: Tensor | None = None,
     count: Tensor | None = None,
     *,
     jet: bool,
@@ -186,11 +186,11 @@ def walk_rows(
     counted = x.new_full((1,), len(x), dtype=torch.int64) if count is None else count
 
     def arguments(programs: int) -> tuple[object, ...]:
-        room = triton.cdiv(tiles, programs) * rows
-        lists = torch.empty(programs * room, dtype=torch.int64, device=x.device)
-        chosen = lists if wanted is None else wanted.contiguous().view(torch.int8)
+        capacity = triton.cdiv(tiles, programs) * rows
+        lists = torch.empty(programs * capacity, dtype=torch.int64, device=x.device)
+        row_mask = lists if mask is None else mask.contiguous().view(torch.int8)
         scratch = half_scratch(x, programs * kept)
-        return x, chosen, *levels.arguments(), value, gradient, lists, scratch, counted, room, levels.taper
+        return x, row_mask, *levels.arguments(), value, gradient, lists, scratch, counted, capacity, levels.taper
 
     launch(
         walk,
@@ -198,7 +198,7 @@ def walk_rows(
         tiles,
         arguments,
         JET=jet,
-        WANTED=wanted is not None,
+        MASKED=mask is not None,
         TAPERED=levels.taper > 0,
         SHAPES=levels.shapes,
         SCRATCH=kept,

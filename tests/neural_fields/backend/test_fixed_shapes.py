@@ -25,13 +25,13 @@ def test_results_are_the_usual_ones(taper: float, capacity: list[int] | None) ->
     with fixed_shapes(capacity) as shapes:
         fixed = field.second_jet(x)
         values, value = field.level_values(x), field.value(x.reshape(4, 100, 3))
-    assert shapes.lost is None or not bool(shapes.lost.any())
+    assert shapes.overflow is None or not bool(shapes.overflow.any())
     bounds = rounding(field, x, lambda field, x: field.second_jet(x))
     assert_within(fixed, usual, bounds, times=2)
     assert_within(value.flatten(), usual.value, 2 * bounds[0])
     assert_within(values[-1], usual.value, 2 * bounds[0])
     inside = field.level_values(x)[0].abs() < field.deltas[0]
-    assert 0 < int(shapes.demand[0]) == int(inside.sum()) < len(x)
+    assert 0 < int(shapes.requested[0]) == int(inside.sum()) < len(x)
 
 
 def test_gradients_are_the_usual_ones() -> None:
@@ -46,29 +46,29 @@ def test_gradients_are_the_usual_ones() -> None:
     torch.testing.assert_close(*grown, rtol=1e-10, atol=1e-10)  # float64 sums of a few hundred numbers
 
 
-@pytest.mark.parametrize("room", [0, 1, 17])
-def test_overflow_has_the_value_of_the_level_before(room: int) -> None:
+@pytest.mark.parametrize("capacity", [0, 1, 17])
+def test_overflow_has_the_value_of_the_level_before(capacity: int) -> None:
     field, x = sdf(), cube(400)
     values = field.level_values(x)
     inside = values[0].abs() < field.deltas[0]
-    with fixed_shapes([room]) as shapes:
+    with fixed_shapes([capacity]) as shapes:
         found = field.value(x, level=1)
-    admitted = inside & (inside.cumsum(0) <= room)
-    assert int(admitted.sum()) == room
-    assert torch.equal(shapes.lost, inside & ~admitted)
+    admitted = inside & (inside.cumsum(0) <= capacity)
+    assert int(admitted.sum()) == capacity
+    assert torch.equal(shapes.overflow, inside & ~admitted)
     bound = rounding(field, x, lambda field, x: field.jet(x, level=1))[0]
     assert_within(found, torch.where(admitted, values[1], values[0]), 2 * bound)
 
 
 def test_points_that_are_masked_out_stay_coarse() -> None:
     field, x = sdf(), cube(400)
-    wanted = torch.arange(len(x)) % 2 == 0
+    mask = torch.arange(len(x)) % 2 == 0
     with fixed_shapes() as shapes:
-        shapes.wanted = wanted
+        shapes.mask = mask
         found = field.value(x)
     usual = field.level_values(x)
     bound = rounding(field, x, lambda field, x: field.jet(x))[0]
-    assert_within(found, torch.where(wanted, usual[-1], usual[0]), 2 * bound)
+    assert_within(found, torch.where(mask, usual[-1], usual[0]), 2 * bound)
 
 
 def test_the_outermost_is_not_touched_by_those_inside() -> None:
@@ -76,8 +76,8 @@ def test_the_outermost_is_not_touched_by_those_inside() -> None:
     with fixed_shapes() as outer:
         with fixed_shapes() as inner:
             field.value(x)
-        assert inner.demand
-        assert not outer.demand
+        assert inner.requested
+        assert not outer.requested
 
 
 @pytest.mark.parametrize("count", [0, 1, 5])
@@ -121,7 +121,7 @@ def test_fields_of_fields_need_no_wait_either(name: str, capacity: list[int] | N
     usual = field.jet(x)
     with fixed_shapes(capacity) as shapes:
         found = field.jet(x)
-    there = torch.ones(len(x), dtype=torch.bool) if shapes.lost is None else ~shapes.lost
+    there = torch.ones(len(x), dtype=torch.bool) if shapes.overflow is None else ~shapes.overflow
     assert (int(there.sum()) < len(x)) == (capacity is not None)
     for a, b in zip(found, usual, strict=True):
         # The same products with other rows beside them, of 16 terms in float64.

@@ -67,10 +67,10 @@ def test_expectations_right_and_wrong(off: float) -> None:
         assert_same_bits((*first, columns[0], *columns[1]), (*second, others[0], *others[1]))
 
 
-@pytest.mark.parametrize("few", [_ahead.FEW, 20], ids=["room", "little-room"])
+@pytest.mark.parametrize("few", [_ahead.FEW, 20], ids=["enough", "overflow"])
 def test_levels_agree_within_the_tolerance(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Matrix products with other rows beside them round differently; each depth is exact to the tolerance."""
-    for name, number in {"FEW": few, "SHARE": 0.01, "LEAST_ROOM": 5, "SPARE": 0.6}.items():
+    for name, number in {"FEW": few, "SHARE": 0.01, "LEAST_CAPACITY": 5, "SPARE": 0.6}.items():
         monkeypatch.setattr(_ahead, name, number)
     origins, directions = rays(torch.float64)
     for field in (three_levels().double(), small_multiscale(0.3).double()):
@@ -80,11 +80,11 @@ def test_levels_agree_within_the_tolerance(few: int, monkeypatch: pytest.MonkeyP
         assert torch.equal(first.level[first.mask], second.level[second.mask])
 
 
-@pytest.mark.parametrize("few", [_ahead.FEW, 5], ids=["room", "little-room"])
+@pytest.mark.parametrize("few", [_ahead.FEW, 5], ids=["enough", "overflow"])
 @pytest.mark.parametrize("name", ["union", "placed", "difference-of-multiscale", "slice"])
 def test_fields_of_fields(name: str, few: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_ahead, "FEW", few)
-    monkeypatch.setattr(_ahead, "LEAST_ROOM", few)
+    monkeypatch.setattr(_ahead, "LEAST_CAPACITY", few)
     field: Field = FIELDS[name]().double()
     origins, directions = rays(torch.float64, 60)
     assert_depths(*both(sphere_trace, field, origins, directions, max_steps=64), 2e-5)

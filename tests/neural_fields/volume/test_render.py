@@ -91,7 +91,7 @@ def test_no_rays_are_legal() -> None:
 
 
 @pytest.mark.parametrize("spare", [None, 0, 7, -1])
-def test_in_fixed_shapes_rays_see_the_same_if_there_is_room(spare: int | None) -> None:
+def test_in_fixed_shapes_rays_see_the_same_if_capacity_suffices(spare: int | None) -> None:
     torch.manual_seed(0)
     field = MultiscaleSDF.from_widths([(16, 1), (16, 1)], omegas=[4, 8], deltas=[0.02], taper=0.5, num_features=3)
     color, around = ColorNetwork(3, width=8, depth=1), BackgroundField(width=8, depth=1)
@@ -109,17 +109,18 @@ def test_in_fixed_shapes_rays_see_the_same_if_there_is_room(spare: int | None) -
     usual = render()
     with fixed_shapes() as shapes:
         fixed = render()
-    asked = {name: int(number) for name, number in shapes.asked.items()}
-    assert asked["sections"] == int((usual[1] > 0).sum()) < usual[1].numel()
-    assert 0 < asked["colors"] < asked["sections"]
-    assert 0 < asked["outside"] < 40
-    (band,) = (int(number) for number in shapes.demand)
-    assert 0 < band < asked["sections"]
+    requested = {name: int(number) for name, number in shapes.named_requested.items()}
+    assert requested["sections"] == int((usual[1] > 0).sum()) < usual[1].numel()
+    assert 0 < requested["colors"] < requested["sections"]
+    assert 0 < requested["outside"] < 40
+    (band,) = (int(number) for number in shapes.requested)
+    assert 0 < band < requested["sections"]
     if spare is not None:
-        with fixed_shapes([band + spare], rooms={name: room + spare for name, room in asked.items()}) as shapes:
+        named = {name: count + spare for name, count in requested.items()}
+        with fixed_shapes([band + spare], named_capacity=named) as shapes:
             fixed = render()
         if spare < 0:  # the overflow is reported, and one ray lacks a section
-            assert int(shapes.asked["sections"]) == asked["sections"]
+            assert int(shapes.named_requested["sections"]) == requested["sections"]
             assert not torch.equal(fixed[0], usual[0])
             return
     for one, same in zip(usual, fixed, strict=True):

@@ -68,7 +68,7 @@ def test_replayed_steps_are_the_same(name: str, images: PosedImages, monkeypatch
     assert trainers[0].run()
     recorded = trainers[0].replays.recorded
     assert 2 <= recorded < TINY.steps / 2
-    assert trainers[0].facts() == {"recorded": recorded, "not_taken": trainers[0].left_out}
+    assert trainers[0].facts() == {"recorded": recorded, "not_taken": trainers[0].not_taken}
     with monkeypatch.context() as patch:
         patch.setattr(Replays, "do", never)
         assert trainers[1].run()
@@ -120,13 +120,13 @@ def test_a_replay_counts_as_a_change_of_the_weights(images: PosedImages) -> None
     assert trainer.replays.recorded > 0
 
 
-def test_a_step_whose_rooms_are_too_small_is_not_taken_and_there_are_larger_ones(images: PosedImages) -> None:
+def test_a_step_that_exceeds_its_capacity_is_not_taken_and_the_capacity_grows(images: PosedImages) -> None:
     trainer = replaying(images, "masks", torch.device("cpu"))
     for _ in range(16):
         trainer._step()
     kind = trainer.objective.ahead(trainer.step, trainer.fraction)._replace(rays=32)
-    trainer.rooms = {kind: (1, 1, 1, 1)}
-    trainer.asked = {}  # so that they are not found too small
+    trainer.capacities = {kind: (1, 1, 1, 1)}
+    trainer.requested = {}  # so that they are not found too small
     before = weights(trainer)
     moments = {name: tensor.clone() for name, tensor in trainer.state().items() if name.startswith("adam.")}
     trainer.objective.ahead = lambda step, done: kind  # pyright: ignore[reportAttributeAccessIssue]
@@ -136,9 +136,9 @@ def test_a_step_whose_rooms_are_too_small_is_not_taken_and_there_are_larger_ones
     assert all(torch.equal(tensor, trainer.state()[name]) for name, tensor in moments.items())
     for _ in range(15):
         trainer._step()
-    assert trainer.left_out == 16
+    assert trainer.not_taken == 16
     trainer._step()
-    assert all(new >= 256 for new in trainer.rooms[kind])
+    assert all(new >= 256 for new in trainer.capacities[kind])
     assert any(not torch.equal(tensor, before[name]) for name, tensor in weights(trainer).items())
 
 
@@ -158,11 +158,11 @@ def test_a_run_that_is_taken_up_records_anew_and_goes_on(images: PosedImages) ->
     torch.testing.assert_close(weights(trainer), weights(other), rtol=0, atol=0)
 
 
-def test_rooms_follow_what_is_asked_for_and_stay_while_they_suit(images: PosedImages) -> None:
+def test_capacities_follow_the_requested_rows_and_stay_while_they_suit(images: PosedImages) -> None:
     trainer = replaying(images, "masks", torch.device("cpu"))
     kind = trainer.objective.ahead(0, 0.0)._replace(rays=100)
-    assert trainer._rooms(kind) is None  # before anything is known there is room for all
-    # 1.25 times as many and 64, in whole 256s; changed where more than 95 % are asked for, or less than half would do.
-    for requested, room in ((10.0, 1536), (14.0, 1536), (15.0, 2048), (6.0, 2048), (5.0, 768)):
-        trainer.asked[kind.level] = [requested, 5.0, 0.0, 2.0]
-        assert trainer._rooms(kind) == (room, 768, 256, 512)
+    assert trainer._capacities(kind) is None  # before anything is known all rows have a place
+    # 1.25 times as many and 64, in whole 256s; changed where more than 95 % are requested, or less than half would do.
+    for requested, capacity in ((10.0, 1536), (14.0, 1536), (15.0, 2048), (6.0, 2048), (5.0, 768)):
+        trainer.requested[kind.level] = [requested, 5.0, 0.0, 2.0]
+        assert trainer._capacities(kind) == (capacity, 768, 256, 512)

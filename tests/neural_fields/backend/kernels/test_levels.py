@@ -125,9 +125,9 @@ def test_points_that_are_masked_out_stay_coarse(place: torch.device, counted: li
     field, x = levels(ALL, place), points(70, place)
     coarse, fine = field.value(x, level=0), field.value(x)
     with fixed_shapes([3, 3]) as shapes:
-        shapes.wanted = torch.arange(70, device=place) % 3 == 0
+        shapes.mask = torch.arange(70, device=place) % 3 == 0
         value = field.value(x)
-        assert shapes.lost is None  # there is room for all
+        assert shapes.overflow is None  # one launch has capacity for all
     assert counted == ["levels_value", "levels_value"]
     # The same network with other rows beside them, whose error `gated_bound` puts below this.
     assert_within(value[::3], fine[::3], 1e-5)
