@@ -83,7 +83,7 @@ class ReconstructBench(Benchmark[ReconstructRow]):
     """NeuS's network, the multiscale one with as many steps, and again for as long as NeuS took, on every scene.
 
     All see the same rays in the same order, with the same numbers of samples and the same threshold below which
-    sections are skipped. NeuS has its own colour network,
+    intervals are skipped. NeuS has its own colour network,
     256 features and the position without an encoding. It has one learning rate for everything but the uncertainty,
     which both sharpen alike. A sheet of all rows per scene is written into the folder of the results.
 

@@ -145,8 +145,8 @@ def render_volume(
 ) -> Rendered:
     """Render rays through the unit sphere; differentiable in the rays and all parameters, ``inv_std`` too.
 
-    Inside `fixed_shapes` the chosen intervals, colours and rays have the capacities "sections", "colors" and "outside",
-    and the host never waits.
+    Inside `fixed_shapes` the chosen intervals, colours and rays have the named capacities "samples", "colors" and
+    "outside", and the host never waits.
 
     Args:
         field: the geometry, in unit-sphere coordinates; or any function of points ``(..., 3)`` → ``(...,)``.
@@ -260,7 +260,7 @@ def render_samples(
     field, (t_starts, t_ends, counts, skipped) = as_field(field), samples
     interval = t_ends - t_starts
     depths = t_starts + 0.5 * interval
-    rows = chosen("sections", counts.flatten() > 0) if skipped else None
+    rows = chosen("samples", counts.flatten() > 0) if skipped else None
 
     def gathered(tensor: Tensor) -> Tensor:
         """``(R, S, …)`` → ``(K, …)``, the intervals that are evaluated."""

@@ -57,7 +57,7 @@ class Outcome(NamedTuple):
 
     terms: dict[str, Tensor]  # of the loss, unweighted
     total: Tensor  # their weighted sum
-    sections: Tensor  # samples that are evaluated per ray, 0-d
+    samples: Tensor  # evaluated per ray, 0-d
 
 
 class SceneObjective(Objective):
@@ -88,7 +88,7 @@ class SceneObjective(Objective):
         super().__init__(model, groups, torch.Generator().manual_seed(config.seed))
         self.model, self.pool, self.config = model, pool, config
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
-        # As of late, on the CPU, which reads them: sections of a ray that are evaluated, and the surface's uncertainty.
+        # Recent values, on the CPU, which reads them: samples evaluated per ray, and the surface's uncertainty.
         self.kept["lately"] = torch.tensor([0.0, 1 / float(model.inv_std.detach())])
         self.focus = Focus(len(pool), config.focus, pool.device)
         self.kept |= self.focus.kept
@@ -124,14 +124,14 @@ class SceneObjective(Objective):
             self.grid.refresh(self.model.geometry, whole=whole)
             self.kept |= {"moved": self.grid.moved, "looks": torch.tensor([step, pause, looks + 1])}
 
-    def remember(self, step: int, sections: Tensor) -> None:
+    def remember(self, step: int, samples: Tensor) -> None:
         """Fetch what the next steps depend on, all at once: a GPU is waited for."""
         unsure = 1 / self.model.inv_std.detach()
-        known = [sections, unsure.to(sections)]
+        known = [samples, unsure.to(samples)]
         if self.grid is None:
             self.kept["lately"] = torch.stack(known).cpu()
             return
-        *lately, moved = torch.stack([*known, self.kept["moved"].to(sections)]).tolist()
+        *lately, moved = torch.stack([*known, self.kept["moved"].to(samples)]).tolist()
         self.kept["lately"] = torch.tensor(lately)
         looked, pause, looks = self.kept["looks"].tolist()
         plan = self.schedule
@@ -141,18 +141,18 @@ class SceneObjective(Objective):
             self.kept["looks"] = torch.tensor([looked, min(max(pause, plan.near_every), plan.near_rest), looks])
 
     def batch(self) -> int:
-        """Rays of the next step: fewer while their sections are many, as they are while the surface is unsure."""
+        """Rays of the next step: fewer while their samples are many, as they are while the surface is uncertain."""
         rays, jets = self.config.rays, self.config.jets
         if not jets:
             return rays
-        sections = float(self.kept["lately"][0])
-        return min(max(round(jets / sections) if sections else 0, math.ceil(self.schedule.least_rays * rays)), rays)
+        samples = float(self.kept["lately"][0])
+        return min(max(round(jets / samples) if samples else 0, math.ceil(self.schedule.least_rays * rays)), rays)
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
         kind = self.ahead(step, done)
         outcome = self.evaluate(kind)
-        self.behind(step, outcome.sections)
+        self.behind(step, outcome.samples)
         return outcome.terms, outcome.total
 
     def ahead(self, step: int, done: float) -> Kind:
@@ -173,10 +173,10 @@ class SceneObjective(Objective):
             measured=measured is not None and (done < self.schedule.faded or measured.is_exact),
         )
 
-    def behind(self, step: int, sections: Tensor) -> None:
-        """Do what follows a step on the host; ``sections`` is the number per ray, 0-d."""
+    def behind(self, step: int, samples: Tensor) -> None:
+        """Do what follows a step on the host; ``samples`` is the number evaluated per ray, 0-d."""
         if (step + 1) % self.schedule.near_every == 0:
-            self.remember(step, sections)
+            self.remember(step, samples)
 
     def by_time(self, number: Callable[[float], float]) -> Tensor | float:
         """A number that follows from the share of the schedule that is done; a tensor where the step is replayed."""
@@ -203,14 +203,14 @@ class SceneObjective(Objective):
             guide=self.grid,
             generator=self.generator,
         )
-        sections = (seen.counts > 0).sum() / len(origins)
+        samples = (seen.counts > 0).sum() / len(origins)
         target = rays.color
         if pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
         wrong = (self.model.photographed(seen, rays.view) - target).abs().mean(dim=1)
         self.focus.learn(rays.row, wrong.detach())
         color = wrong.mean()
-        # A mean over all sections within the region, those that were skipped included: some stand for the others.
+        # A mean over all intervals within the region, skipped ones included: some kept ones count for them.
         within = (seen.counts > 0).any(dim=1).sum().to(wrong).clamp(min=1) * seen.counts.shape[1]
         eikonal = (seen.counts * eikonal_loss(seen.jet.gradient)).sum() / within
         terms = {"color": color, "eikonal": eikonal}
@@ -225,7 +225,7 @@ class SceneObjective(Objective):
             terms["depth"] = depth
             total = total + config.depth_weight * depth
         terms["uncertainty"] = 1 / self.model.inv_std
-        return Outcome(terms, total, sections)
+        return Outcome(terms, total, samples)
 
     def depth_term(self, measured: MeasuredDepths, level: int) -> Tensor:
         """How far the surface is from what was measured: the mean of `depth_loss` over rays at random."""
@@ -238,7 +238,7 @@ class SceneObjective(Objective):
         return torch.where(rays.exact, missed, left * missed).mean()
 
 
-CHOICES = ("sections", "colors", "outside")
+CHOICES = ("samples", "colors", "outside")
 
 
 @dataclass(frozen=True)
@@ -305,8 +305,8 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         terms = dict(self.replays.do((kind, capacities), lambda: self._work(kind, capacities)))
         # A replay changes parameters behind PyTorch's back; the fused kernels pack them again by their versions.
         torch.autograd.graph.increment_version(self.trained)
-        sections = terms.pop("sections")
-        self.objective.behind(self.step, sections)
+        samples = terms.pop("samples")
+        self.objective.behind(self.step, samples)
         self.step += 1
         if self.step % self.objective.schedule.near_every == 0:
             self._read_requested(kind)
@@ -333,7 +333,7 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         self.adam.found_inf = overflow  # pyright: ignore[reportAttributeAccessIssue]  of a step that is not taken it is 1
         self.descend(outcome.total)
         terms = {name: term.detach() for name, term in outcome.terms.items()}
-        return terms | {"sections": outcome.sections}
+        return terms | {"samples": outcome.samples}
 
     def _requested(self, shapes: FixedShapes) -> Tensor:
         """How many rows were to be chosen, of `CHOICES` and in each band."""

@@ -91,7 +91,7 @@ def test_replayed_steps_are_watched_too(scene: BenchScene, monkeypatch: pytest.M
     usual, fixed = watched
     assert fixed.finished
     assert fixed.trainer.replays.recorded > 0
-    # Fixed shapes have room for all sections, and so for all levels and colours.
+    # Fixed shapes have capacity for all samples, and so for all levels and colours.
     for replayed, plain in zip((*fixed.jets, fixed.colors), (*usual.jets, usual.colors), strict=True):
         assert replayed >= plain > 0
     assert fixed.late.steps == 6

@@ -110,17 +110,17 @@ def test_in_fixed_shapes_rays_see_the_same_if_capacity_suffices(spare: int | Non
     with fixed_shapes() as shapes:
         fixed = render()
     requested = {name: int(number) for name, number in shapes.named_requested.items()}
-    assert requested["sections"] == int((usual[1] > 0).sum()) < usual[1].numel()
-    assert 0 < requested["colors"] < requested["sections"]
+    assert requested["samples"] == int((usual[1] > 0).sum()) < usual[1].numel()
+    assert 0 < requested["colors"] < requested["samples"]
     assert 0 < requested["outside"] < 40
     (band,) = (int(number) for number in shapes.requested)
-    assert 0 < band < requested["sections"]
+    assert 0 < band < requested["samples"]
     if spare is not None:
         named = {name: count + spare for name, count in requested.items()}
         with fixed_shapes([band + spare], named_capacity=named) as shapes:
             fixed = render()
-        if spare < 0:  # the overflow is reported, and one ray lacks a section
-            assert int(shapes.named_requested["sections"]) == requested["sections"]
+        if spare < 0:  # the overflow is reported, and one ray lacks a sample
+            assert int(shapes.named_requested["samples"]) == requested["samples"]
             assert not torch.equal(fixed[0], usual[0])
             return
     for one, same in zip(usual, fixed, strict=True):
@@ -220,7 +220,7 @@ def test_sections_of_rays_that_miss_the_sphere_stand_for_nothing(skip: float) ->
     both = seen([0, 1, 2])
     assert (both.counts > 0).any(dim=1).tolist() == [True, False, False]
     assert both.opacity[1:].tolist() == [0.0, 0.0]
-    nothing = seen([1, 2])  # no section at all is evaluated
+    nothing = seen([1, 2])  # no sample at all is evaluated
     assert not nothing.counts.any()
     assert bool(torch.isfinite(nothing.color).all())
     nothing.color.sum().backward()
@@ -237,7 +237,7 @@ def test_what_is_behind_something_opaque_is_not_asked_for() -> None:
     seen = render_volume(Sphere(radius=0.5), red, EYES, ALONG, early_stop_eps=1e-4, **options)
     assert torch.equal(asked[0], ALONG[1:].repeat_interleave(4, dim=0))
     expected = render_volume(Sphere(radius=0.5), red, EYES, ALONG, **options)
-    # A ray of S sections loses 1e-4 of each at most, and of the light that is left.
+    # A ray of S samples loses 1e-4 of each at most, and of the light that is left.
     torch.testing.assert_close(seen.color, expected.color, rtol=0, atol=1e-4 * (expected.weights.shape[1] + 1))
 
 
@@ -281,7 +281,7 @@ class TestSkipping:
         assert bool((error <= lost + 1e-12).all())
         torch.testing.assert_close(some.weights.sum(dim=1) + (1 - some.opacity), torch.ones(300).double())
         assert float(some.weights[skipped].abs().max()) == 0
-        # Each neighbourhood that was found light has less than its estimate; 129 sections are on a ray.
+        # Each neighbourhood that was found light has less than its estimate; 129 intervals are on a ray.
         assert float(lost.max()) < 129 * skip
 
     def test_nothing_changes_where_nothing_is_skipped(self) -> None:
@@ -316,5 +316,5 @@ class TestSkipping:
         assert base.values == residual.values == 0
         assert base.jets == int((guided.counts > 0).sum())
         full = render_volume(field, position_color, origins, directions, inv_std=150.0)
-        # Both place sections of their own around the same surface: 1/s is what they may differ by in depth.
+        # Both place samples of their own around the same surface: 1/s is what they may differ by in depth.
         assert float((guided.color - full.color).abs().max()) < 1 / 150

@@ -11,7 +11,7 @@ F64 = torch.float64
 
 
 def along_plane(offset: float, angle: float, samples: int, span: float = 2.0) -> tuple[torch.Tensor, ...]:
-    """Values, slopes and lengths of the sections of a ray that meets a plane at depth ``offset`` under an angle."""
+    """Values, slopes and lengths of the intervals of a ray that meets a plane at depth ``offset`` under an angle."""
     cosine = -math.cos(angle)
     edges = torch.linspace(0, span, samples + 1, dtype=F64)[None]
     middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
@@ -52,16 +52,16 @@ class TestWeights:
         weights, remaining = volume.transmittance_weights(depth)
         for ray in range(3):
             light = 1.0
-            for section in range(7):
-                alpha = 1 - math.exp(-float(depth[ray, section]))
-                assert float(weights[ray, section]) == pytest.approx(light * alpha, abs=1e-14)
+            for index in range(7):
+                alpha = 1 - math.exp(-float(depth[ray, index]))
+                assert float(weights[ray, index]) == pytest.approx(light * alpha, abs=1e-14)
                 light *= 1 - alpha
             assert float(remaining[ray]) == pytest.approx(light, abs=1e-14)
         assert volume.transmittance_weights(depth[:, :0])[1].tolist() == [1, 1, 1]
 
     @pytest.mark.parametrize("angle", [0.0, 0.6, 1.2])
     def test_of_a_plane_are_the_logistic_density(self, angle: float) -> None:
-        # Telescoping: the light behind depth t is Φ(f(t)) / Φ(f(0)), exactly, on any sections.
+        # Telescoping: the light behind depth t is Φ(f(t)) / Φ(f(0)), exactly, on any intervals.
         value, slope, interval = along_plane(0.8, angle, 37)
         s = 40.0
         weights, remaining = volume.transmittance_weights(volume.neus_optical_depth(value, slope, interval, s))

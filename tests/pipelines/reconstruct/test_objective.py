@@ -77,11 +77,11 @@ def test_some_steps_lower_the_errors(images: PosedImages) -> None:
     assert set(trainer.losses) == {"color", "eikonal", "mask", "uncertainty"}
 
 
-def test_a_step_has_fewer_rays_while_each_has_many_sections(images: PosedImages) -> None:
+def test_a_step_has_fewer_rays_while_each_has_many_samples(images: PosedImages) -> None:
     trainer = make(images, replace(TINY, rays=32, jets=64, steps=20))
     objective = trainer.objective
-    for sections, rays in ((0.0, 8), (100.0, 8), (4.0, 16), (1.0, 32)):
-        objective.kept["lately"] = torch.tensor([sections, 0.1])
+    for samples, rays in ((0.0, 8), (100.0, 8), (4.0, 16), (1.0, 32)):
+        objective.kept["lately"] = torch.tensor([samples, 0.1])
         assert objective.batch() == rays
     train(trainer, until=16)
     found, unsure = objective.kept["lately"].tolist()
@@ -296,7 +296,7 @@ def test_rays_that_miss_the_region_leave_the_eikonal_term_alone(images: PosedIma
     pool = RayPool(images.views, narrow(images), torch.device("cpu"), whole=True)
     objective = scene_trainer(build_scene(config, has_masks=True), pool, config).objective
     terms, _ = objective.losses(0, 0.5)
-    generator = torch.Generator().manual_seed(config.seed)  # the same rays, and the same sections
+    generator = torch.Generator().manual_seed(config.seed)  # the same rays, and the same samples
     rays = pool.draw(objective.batch(), generator, objective.focus)
     near, far = sphere_span(rays.origins, rays.directions)
     hits = far > near
