@@ -27,8 +27,8 @@ from mplicits.neural_fields import Field, Jet
 from mplicits.neural_fields.networks.colors import BackgroundField, ColorNetwork
 from mplicits.neural_fields.networks.multiscale import levels_of
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
-from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective, scene_trainer
-from mplicits.pipelines.training.replay import Recorder, Results, Work
+from mplicits.pipelines.reconstruct.objective import GraphTrainer, SceneObjective, scene_trainer
+from mplicits.pipelines.training.cuda_graphs import Recorder, Results, Work
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import Progress, StopFlag, Trainer
 from torch import Tensor, nn
@@ -102,7 +102,7 @@ def train_watched(
 ) -> Watched:
     """Train to the end of the schedule, or until ``flag`` asks to stop.
 
-    On a GPU steps are replayed in fixed shapes, and the rows that are counted include the room that was not needed.
+    On a GPU steps are replayed in fixed shapes, and the rows that are counted include unused capacity.
 
     Args:
         model: on the pool's device.
@@ -119,8 +119,8 @@ def train_watched(
     colors, outsides = _RowCounter(model.color), _RowCounter(model.outside)
     config = replace(config, steps=config.steps if seconds is None else ENDLESS)
     trainer = scene_trainer(model, pool, config, seconds=seconds)
-    if isinstance(trainer, ReplayedTrainer):
-        trainer.replays.recorder = Tallied(trainer.replays.recorder, [*levels, colors, outsides])
+    if isinstance(trainer, GraphTrainer):
+        trainer.graphs.recorder = Tallied(trainer.graphs.recorder, [*levels, colors, outsides])
     clocks, every = None, REPORT_EVERY
     if pool.device.type == "cpu":
         every = 1
@@ -163,7 +163,7 @@ class _Watch:
         clocks: tuple[_Clock, _Clock, _Clock] | None,
     ) -> None:
         self.trainer, self.levels, self.colors, self.report, self.clocks = trainer, levels, colors, report, clocks
-        self.half: LateRows | None = None  # what had been asked for when half was done
+        self.half: LateRows | None = None  # the rows requested in the first half
         self.half_times: tuple[float, ...] = ()
         self.times: list[float] = []  # of a step, from one report to the next
         self.spent = 0.0
@@ -215,7 +215,7 @@ class _Watch:
 
 
 class Tallied(Recorder):
-    """A recorder whose replays are counted: as many rows each time as when the work was recorded.
+    """A recorder whose replays are counted: as many rows each time as at the recording.
 
     Args:
         recorder: records and replays.
@@ -231,13 +231,13 @@ class Tallied(Recorder):
         before = self._read()
         try:
             replay, results = self.recorder.record(work)
-            asked = [now - then for now, then in zip(self._read(), before, strict=True)]
+            rows = [now - then for now, then in zip(self._read(), before, strict=True)]
         finally:
             self._write(before)
 
         def counted_replay() -> None:
             replay()
-            self._write([now + more for now, more in zip(self._read(), asked, strict=True)])
+            self._write([now + more for now, more in zip(self._read(), rows, strict=True)])
 
         return counted_replay, results
 
@@ -270,12 +270,12 @@ class _Clock:
 
     def __init__(self, owner: Any, method: str) -> None:
         self.owner, self.method, self.seconds = owner, method, 0.0
-        asked = getattr(owner, method)
+        evaluate = getattr(owner, method)
 
         def timed(*args: Any, **options: Any) -> Any:
             begun = time.perf_counter()
             try:
-                return asked(*args, **options)
+                return evaluate(*args, **options)
             finally:
                 self.seconds += time.perf_counter() - begun
 

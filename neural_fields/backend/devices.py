@@ -38,90 +38,90 @@ def upload(tensor: Tensor, device: torch.device | str) -> Tensor:
     return tensor.pin_memory().to(device, non_blocking=True)
 
 
-class Supply:
-    """Inputs from the host for work that a device repeats with the same operations, as a CUDA graph wants them.
+class GraphInputs:
+    """Inputs from the host for work that a device repeats with the same operations, as a CUDA graph requires.
 
-    The first run, inside `noting`, records how each input is made. Inside `supplied`, `handed` returns views of fixed
-    device memory, which `renew` fills again: in the same order, with one copy per dtype.
+    The first run, inside `recording`, records how each input is made. Inside `static`, `graph_input` returns views of
+    fixed device memory, which `update` fills again: in the same order, with one copy per dtype.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self._makers: list[Callable[[], Tensor]] = []
         self._shapes: list[tuple[torch.dtype, torch.Size]] = []
-        self._stores: dict[torch.dtype, Tensor] = {}
-        self._places: list[Tensor] = []
+        self._buffers: dict[torch.dtype, Tensor] = {}
+        self._views: list[Tensor] = []
         self._next: int | None = None
 
     @contextmanager
-    def noting(self) -> Iterator[None]:
-        """Record every `handed` call of the block; used once."""
-        token = _supply.set(self)
+    def recording(self) -> Iterator[None]:
+        """Record every `graph_input` call of the block; used once."""
+        token = _inputs.set(self)
         try:
             yield
         finally:
-            _supply.reset(token)
-        self._lay_out()
+            _inputs.reset(token)
+        self._allocate()
 
     @contextmanager
-    def supplied(self) -> Iterator[None]:
-        """Inside, `handed` returns what `renew` has written, and makes nothing."""
+    def static(self) -> Iterator[None]:
+        """Inside, `graph_input` returns the memory that `update` fills, and makes nothing."""
         self._next = 0
-        token = _supply.set(self)
+        token = _inputs.set(self)
         try:
             yield
         finally:
-            _supply.reset(token)
+            _inputs.reset(token)
             self._next = None
 
-    def renew(self) -> None:
+    def update(self) -> None:
         """Make all inputs again, for the next run."""
         made = [make() for make in self._makers]
-        for dtype, store in self._stores.items():
+        for dtype, buffer in self._buffers.items():
             flat = torch.cat([one.reshape(-1) for one in made if one.dtype == dtype])
-            store.copy_(upload(flat, self.device), non_blocking=True)
+            buffer.copy_(upload(flat, self.device), non_blocking=True)
 
-    def _lay_out(self) -> None:
+    def _allocate(self) -> None:
         """Allocate memory for the recorded inputs, and views of it, one for each."""
         sizes: dict[torch.dtype, int] = {}
         starts = []
         for dtype, shape in self._shapes:
             starts.append(sizes.get(dtype, 0))
             sizes[dtype] = starts[-1] + shape.numel()
-        self._stores = {dtype: torch.zeros(size, dtype=dtype, device=self.device) for dtype, size in sizes.items()}
-        self._places = [
-            self._stores[dtype][start : start + shape.numel()].view(shape)
+        self._buffers = {dtype: torch.zeros(size, dtype=dtype, device=self.device) for dtype, size in sizes.items()}
+        self._views = [
+            self._buffers[dtype][start : start + shape.numel()].view(shape)
             for start, (dtype, shape) in zip(starts, self._shapes, strict=True)
         ]
 
-    def give(self, make: Callable[[], Tensor]) -> Tensor:
-        """See `handed`."""
+    def get(self, make: Callable[[], Tensor]) -> Tensor:
+        """See `graph_input`."""
         if self._next is not None:
             self._next += 1
-            return self._places[self._next - 1]
+            return self._views[self._next - 1]
         made = make()
         self._makers.append(make)
         self._shapes.append((made.dtype, made.shape))
         return upload(made, self.device)
 
 
-_supply: ContextVar[Supply | None] = ContextVar("supply", default=None)
+_inputs: ContextVar[GraphInputs | None] = ContextVar("inputs", default=None)
 
 
-def handed(make: Callable[[], Tensor], device: torch.device) -> Tensor:
-    """``make()`` on ``device``; inside a `Supply`, made again for each run. Its shape must not change between calls."""
-    supply = _supply.get()
-    return upload(make(), device) if supply is None else supply.give(make)
+def graph_input(make: Callable[[], Tensor], device: torch.device) -> Tensor:
+    """``make()`` on ``device``, made again for each run of `GraphInputs`. Its shape must not change between calls."""
+    inputs = _inputs.get()
+    return upload(make(), device) if inputs is None else inputs.get(make)
 
 
 def uniform(shape: Sequence[int], generator: torch.Generator, device: torch.device) -> Tensor:
-    """Random numbers in [0, 1) of ``shape``, drawn on the host, `handed` to ``device``."""
-    return handed(lambda: torch.rand(*shape, generator=generator), device)
+    """Random numbers in [0, 1) of ``shape``, drawn on the host as a `graph_input`."""
+    return graph_input(lambda: torch.rand(*shape, generator=generator), device)
 
 
-def is_supplied() -> bool:
-    """Whether a `Supply` repeats this work, so that inputs from the host must go through `handed`."""
-    return _supply.get() is not None
+def has_graph_inputs() -> bool:
+    """Whether this work is repeated with `GraphInputs`, so that inputs from the host must go through `graph_input`."""
+    return _inputs.get() is not None
 
 
 def few_numbers(numbers: Sequence[float], like: Tensor) -> Tensor:
@@ -216,7 +216,7 @@ def over_blocks(rows: int, size: int, prepare: Callable[[int], Step], *, like: T
 
 
 class _Blocks:
-    """Slices of the rows, each handed out once, to any thread."""
+    """Slices of the rows; each goes to one thread, once."""
 
     def __init__(self, rows: int, size: int) -> None:
         self._starts = iter(range(0, rows, size))

@@ -16,7 +16,7 @@ from ...datasets.cameras import Camera
 from ...datasets.views.formats.shots import DepthMap
 from ...datasets.views.images import OBJECT, PosedImage, PosedImages
 from ...neural_fields import Field, InputError, sphere_trace
-from ...neural_fields.backend.devices import handed, uniform
+from ...neural_fields.backend.devices import graph_input, uniform
 from ...neural_fields.fields.field import FieldLike
 from ...neural_fields.volume.weights import sphere_span
 
@@ -122,7 +122,7 @@ class MeasuredDepths:
 
     def draw(self, count: int, generator: torch.Generator) -> DepthRays:
         """``count`` measurements at random, with replacement."""
-        return self.at(handed(lambda: torch.randint(len(self), (count,), generator=generator), self.device))
+        return self.at(graph_input(lambda: torch.randint(len(self), (count,), generator=generator), self.device))
 
     @torch.no_grad()
     def settle(self, distance: FieldLike) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
-from ...neural_fields.backend.devices import handed, precise
+from ...neural_fields.backend.devices import graph_input, precise
 from ...neural_fields.networks.colors import BackgroundField, ColorNetwork, Radiance
 from ...neural_fields.networks.grids import HashEncoding
 from ...neural_fields.networks.multiscale import fit_sphere
@@ -286,7 +286,7 @@ class RayPool:
                 return torch.randint(len(self), (count,), generator=generator)
             return focus.rows(count, generator)
 
-        rows = handed(draw, self.device)
+        rows = graph_input(draw, self.device)
         view, pixel = self.owners[rows].long(), self.pixels[rows].long()
         fx, fy, cx, cy = self.lens[view].unbind(dim=1)
         x, y = pixel % self.widths[view], pixel // self.widths[view]

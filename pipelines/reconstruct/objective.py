@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ...neural_fields.backend.devices import handed, is_supplied
+from ...neural_fields.backend.devices import graph_input, has_graph_inputs
 from ...neural_fields.backend.fixed_shapes import FixedShapes, fixed_shapes
 from ...neural_fields.fields.losses import eikonal_loss
 from ...neural_fields.networks.grids import ValueGrid, tables_apart
 from ...neural_fields.volume.render import Sampling
-from ..training.replay import CudaGraphs, Recorder, Replays
+from ..training.cuda_graphs import CudaGraphRecorder, GraphCache, Recorder
 from ..training.settings import ReconstructConfig
 from ..training.trainer import Focus, Group, Objective, Trainer, warm_cosine
 from .measured import MeasuredDepths, depth_loss
@@ -179,12 +179,12 @@ class SceneObjective(Objective):
             self.remember(step, samples)
 
     def by_time(self, number: Callable[[float], float]) -> Tensor | float:
-        """A number that follows from the share of the schedule that is done; a tensor where the step is replayed."""
+        """A number that depends on the share of the schedule that is done; a tensor in a CUDA graph."""
         device = self.pool.device
-        return handed(lambda: torch.tensor(number(self.done)), device) if is_supplied() else number(self.done)
+        return graph_input(lambda: torch.tensor(number(self.done)), device) if has_graph_inputs() else number(self.done)
 
     def evaluate(self, kind: Kind) -> Outcome:
-        """The losses of a fresh batch; nothing of it depends on the step but by what it is `handed`."""
+        """The losses of a fresh batch; it depends on the step only through each `graph_input`."""
         config, pool = self.config, self.pool
         self.model.widen(config.band, config.least_delta)
         rays = pool.draw(kind.rays, self.generator, self.focus)
@@ -265,8 +265,8 @@ class Capacity:
 Capacities = tuple[int, ...] | None
 
 
-class ReplayedTrainer(Trainer[SceneObjective]):
-    """A `Trainer` of a scene whose steps are replayed; ``recorder`` None is for CUDA's graphs.
+class GraphTrainer(Trainer[SceneObjective]):
+    """A `Trainer` of a scene whose steps are CUDA graphs, or what another ``recorder`` replays.
 
     How many samples of rays are evaluated, lie in bands, and get colours differs from step to step, and a recorded step
     has a capacity for each. It follows, every sixteen steps, from the most that was requested in the last sixteen. A
@@ -278,7 +278,7 @@ class ReplayedTrainer(Trainer[SceneObjective]):
     def __init__(self, objective: SceneObjective, *, recorder: Recorder | None = None, **others: Any) -> None:
         super().__init__(objective, **others)
         device = self.trained[0].device
-        self.replays = Replays(device, recorder or CudaGraphs())
+        self.graphs = GraphCache(device, recorder or CudaGraphRecorder())
         for group in self.adam.param_groups:
             group["capturable"] = device.type == "cuda"
         # The most rows requested lately, of CHOICES and residual levels; and the number of steps not taken.
@@ -288,21 +288,21 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         self.not_taken = 0
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """See `Trainer.restore`; what was recorded is forgotten, because it is about other memory."""
+        """See `Trainer.restore`; recorded graphs are dropped, because they use other memory."""
         super().restore(state)
-        self.replays = Replays(self.replays.device, self.replays.recorder)
+        self.graphs = GraphCache(self.graphs.device, self.graphs.recorder)
 
     def facts(self) -> dict[str, Any]:
         """Kinds of steps that were recorded, steps that were not taken, and why nothing is recorded, if so."""
-        refused = {"refused": self.replays.refused} if self.replays.refused else {}
-        return {"recorded": self.replays.recorded, "not_taken": self.not_taken, **refused}
+        refused = {"refused": self.graphs.refused} if self.graphs.refused else {}
+        return {"recorded": self.graphs.recorded, "not_taken": self.not_taken, **refused}
 
     def _step(self) -> dict[str, Tensor]:
         kind = self.objective.ahead(self.step, self.fraction)
         part = math.ceil(self.objective.config.rays / self.capacity.ray_counts)
         kind = kind._replace(rays=math.ceil(kind.rays / part) * part)
         capacities = self._capacities(kind)
-        terms = dict(self.replays.do((kind, capacities), lambda: self._work(kind, capacities)))
+        terms = dict(self.graphs.run((kind, capacities), lambda: self._work(kind, capacities)))
         # A replay changes parameters behind PyTorch's back; the fused kernels pack them again by their versions.
         torch.autograd.graph.increment_version(self.trained)
         samples = terms.pop("samples")
@@ -315,7 +315,7 @@ class ReplayedTrainer(Trainer[SceneObjective]):
     def _work(self, kind: Kind, capacities: Capacities) -> dict[str, Tensor]:
         """A step as the device does it."""
         objective = self.objective
-        rates = handed(
+        rates = graph_input(
             lambda: torch.tensor([rate(objective.done) for _, rate in objective.groups]), self.trained[0].device
         )
         for group, rate in zip(self.adam.param_groups, rates.unbind(), strict=True):
@@ -368,7 +368,7 @@ def scene_trainer(
     measured: MeasuredDepths | None = None,
     seconds: float | None = None,
 ) -> Trainer[SceneObjective]:
-    """The training of a scene; see `SceneObjective` and `Trainer`. On a GPU, it is replayed."""
+    """The training of a scene; see `SceneObjective` and `Trainer`. On a GPU its steps are CUDA graphs."""
     objective = SceneObjective(model, pool, config, measured)
-    kind = ReplayedTrainer if config.graphs and pool.device.type == "cuda" else Trainer
+    kind = GraphTrainer if config.graphs and pool.device.type == "cuda" else Trainer
     return kind(objective, stage="reconstruct", steps=config.steps, seconds=seconds, network_name="model")

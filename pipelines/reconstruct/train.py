@@ -32,7 +32,7 @@ from ..training.trainer import Interrupted, load_compiler, parameter_count, stop
 from .hull import Agreement, begin
 from .measured import MeasuredDepths
 from .model import RayPool, SceneModel, build_scene
-from .objective import ReplayedTrainer, scene_trainer
+from .objective import GraphTrainer, scene_trainer
 from .views import (
     SeenFrom,
     ViewImage,
@@ -374,7 +374,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
             "inv_std": float(model.inv_std.detach()),
             "steps": trainer.step,
             "training_seconds": round(trainer.elapsed, 3),
-            **({"replayed": trainer.facts()} if isinstance(trainer, ReplayedTrainer) else {}),
+            **({"replayed": trainer.facts()} if isinstance(trainer, GraphTrainer) else {}),
             "losses": trainer.losses,
         }
 

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from fields import FIELDS, small_multiscale
-from mplicits.pipelines.training.replay import Recorder
+from mplicits.pipelines.training.cuda_graphs import Recorder
 
 from benchmarks.costs.speed import counted
 from benchmarks.scenes.flops import Tallied

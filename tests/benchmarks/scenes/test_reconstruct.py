@@ -12,8 +12,8 @@ from mplicits.neural_fields import Siren, Sphere, Union, extract_mesh
 from mplicits.neural_fields.networks.colors import BackgroundField, ColorNetwork
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
-from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective, scene_trainer
-from mplicits.pipelines.training.replay import Again
+from mplicits.pipelines.reconstruct.objective import GraphTrainer, SceneObjective, scene_trainer
+from mplicits.pipelines.training.cuda_graphs import EagerRecorder
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import StopFlag
 from reconstructions import small_reconstructions
@@ -75,9 +75,9 @@ def test_counted_flops_are_those_of_a_training(scene: BenchScene, geometry: str)
     assert watched.geometry_flops + watched.color_flops == pytest.approx(counter.get_total_flops(), rel=0.02)
 
 
-def replaying(model: SceneModel, pool: RayPool, config: ReconstructConfig, *, seconds: float | None) -> ReplayedTrainer:
+def with_graphs(model: SceneModel, pool: RayPool, config: ReconstructConfig, *, seconds: float | None) -> GraphTrainer:
     objective = SceneObjective(model, pool, config)
-    return ReplayedTrainer(objective, recorder=Again(), stage="reconstruct", steps=config.steps, seconds=seconds)
+    return GraphTrainer(objective, recorder=EagerRecorder(), stage="reconstruct", steps=config.steps, seconds=seconds)
 
 
 def test_replayed_steps_are_watched_too(scene: BenchScene, monkeypatch: pytest.MonkeyPatch):
@@ -86,11 +86,11 @@ def test_replayed_steps_are_watched_too(scene: BenchScene, monkeypatch: pytest.M
     watched = []
     for replayed in (False, True):
         if replayed:
-            monkeypatch.setattr(flops, "scene_trainer", replaying)
+            monkeypatch.setattr(flops, "scene_trainer", with_graphs)
         watched.append(flops.train_watched(build_scene(config, has_masks=True), pool, config, StopFlag()))
     usual, fixed = watched
     assert fixed.finished
-    assert fixed.trainer.replays.recorded > 0
+    assert fixed.trainer.graphs.recorded > 0
     # Fixed shapes have capacity for all samples, and so for all levels and colours.
     for replayed, plain in zip((*fixed.jets, fixed.colors), (*usual.jets, usual.colors), strict=True):
         assert replayed >= plain > 0

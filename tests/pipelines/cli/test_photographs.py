@@ -18,9 +18,9 @@ from mplicits.datasets.views.writing import write_colmap
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.reconstruct import train
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
-from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective
+from mplicits.pipelines.reconstruct.objective import GraphTrainer, SceneObjective
 from mplicits.pipelines.surface.surface import read_surface
-from mplicits.pipelines.training.replay import Recorder, Work
+from mplicits.pipelines.training.cuda_graphs import Recorder, Work
 from mplicits.pipelines.training.settings import ReconstructConfig
 
 TINY = (
@@ -94,9 +94,9 @@ def test_steps_that_could_not_be_recorded_are_said(tmp_path, monkeypatch, capsys
         def record(self, work: Work) -> NoReturn:
             raise RuntimeError("no memory for graphs")
 
-    def on_a_gpu(model: SceneModel, pool: RayPool, config: ReconstructConfig, **others: Any) -> ReplayedTrainer:
+    def on_a_gpu(model: SceneModel, pool: RayPool, config: ReconstructConfig, **others: Any) -> GraphTrainer:
         objective = SceneObjective(model, pool, config, others.pop("measured"))
-        return ReplayedTrainer(objective, recorder=Refusing(), stage="reconstruct", steps=config.steps)
+        return GraphTrainer(objective, recorder=Refusing(), stage="reconstruct", steps=config.steps)
 
     monkeypatch.setattr(train, "scene_trainer", on_a_gpu)
     project, run = photographs(tmp_path / "project"), tmp_path / "run"

@@ -1,4 +1,4 @@
-"""Replayed steps of a scene: the same as usual ones, with buffers that follow the counts of samples."""
+"""Steps of a scene as CUDA graphs: the results of eager steps, with capacities that follow the counts of samples."""
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
@@ -8,13 +8,20 @@ import pytest
 import standin
 import torch
 from mplicits.datasets.views.images import PosedImages
-from mplicits.neural_fields.backend.devices import Supply
+from mplicits.neural_fields.backend.devices import GraphInputs
 from mplicits.neural_fields.networks.multiscale import fit_sphere
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
-from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective
-from mplicits.pipelines.training.replay import Again, CudaGraphs, Recorder, Replays, Results, Work
+from mplicits.pipelines.reconstruct.objective import GraphTrainer, SceneObjective
+from mplicits.pipelines.training.cuda_graphs import (
+    CudaGraphRecorder,
+    EagerRecorder,
+    GraphCache,
+    Recorder,
+    Results,
+    Work,
+)
 from mplicits.pipelines.training.trainer import Trainer
 from reconstructions import QUICK, TINY_SCENE, painted_sphere, weights, without
 from torch import Tensor
@@ -31,7 +38,7 @@ KINDS = {
 
 @pytest.fixture(autouse=True)
 def _short_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A rough sphere will do to begin with."""
+    """Starts from a rough sphere."""
     monkeypatch.setattr(scene_model, "fit_sphere", partial(fit_sphere, steps=40, batch=256))
 
 
@@ -50,15 +57,15 @@ def scene(images: PosedImages, name: str, device: torch.device) -> SceneObjectiv
     return SceneObjective(model, pool, config, measured)
 
 
-def replaying(images: PosedImages, name: str, device: torch.device) -> ReplayedTrainer:
+def replaying(images: PosedImages, name: str, device: torch.device) -> GraphTrainer:
     objective = scene(images, name, device)
-    recorder = CudaGraphs() if device.type == "cuda" else Again()
-    return ReplayedTrainer(objective, recorder=recorder, stage="reconstruct", steps=objective.config.steps)
+    recorder = CudaGraphRecorder() if device.type == "cuda" else EagerRecorder()
+    return GraphTrainer(objective, recorder=recorder, stage="reconstruct", steps=objective.config.steps)
 
 
-def never(self: Replays, kind: Hashable, work: Callable[[], Mapping[str, Tensor]]) -> Mapping[str, Tensor]:
-    """In place of `Replays.do`: every time as the first time."""
-    with Supply(self.device).noting():
+def never(self: GraphCache, kind: Hashable, work: Callable[[], Mapping[str, Tensor]]) -> Mapping[str, Tensor]:
+    """Replaces `GraphCache.run`: every run is eager, as the first one."""
+    with GraphInputs(self.device).recording():
         return work()
 
 
@@ -66,11 +73,11 @@ def never(self: Replays, kind: Hashable, work: Callable[[], Mapping[str, Tensor]
 def test_replayed_steps_are_the_same(name: str, images: PosedImages, monkeypatch: pytest.MonkeyPatch) -> None:
     trainers = [replaying(images, name, torch.device("cpu")) for _ in range(2)]
     assert trainers[0].run()
-    recorded = trainers[0].replays.recorded
+    recorded = trainers[0].graphs.recorded
     assert 2 <= recorded < TINY.steps / 2
     assert trainers[0].facts() == {"recorded": recorded, "not_taken": trainers[0].not_taken}
     with monkeypatch.context() as patch:
-        patch.setattr(Replays, "do", never)
+        patch.setattr(GraphCache, "run", never)
         assert trainers[1].run()
     torch.testing.assert_close(weights(trainers[1]), weights(trainers[0]), rtol=0, atol=0)
 
@@ -85,15 +92,15 @@ def test_the_host_never_waits_for_a_replayed_step(name: str, images: PosedImages
         assert all(bool(tensor.isfinite().all()) for tensor in weights(there).values())
         return
     for step in range(there.steps):
-        recorded = there.replays.recorded
+        recorded = there.graphs.recorded
         with standin.counted() as book:
             there._step()
-        if step % 16 not in (0, 15) and there.replays.recorded == recorded:
+        if step % 16 not in (0, 15) and there.graphs.recorded == recorded:
             assert book.synchronisations == 0 or step < 2, (step, book.report())
     torch.testing.assert_close(weights(there), weights(here), rtol=0, atol=0)
 
 
-def test_the_first_steps_are_the_usual_ones(images: PosedImages) -> None:
+def test_the_first_steps_equal_eager_ones(images: PosedImages) -> None:
     usual = Trainer(scene(images, "masks", torch.device("cpu")), stage="reconstruct", steps=TINY.steps)
     trainer = replaying(images, "masks", torch.device("cpu"))
     for _ in range(6):  # as long as there is no other number of rays
@@ -102,22 +109,22 @@ def test_the_first_steps_are_the_usual_ones(images: PosedImages) -> None:
             assert float(other) == pytest.approx(float(one), rel=1e-4)
 
 
-class Unheard(Recorder):
-    """A replay that PyTorch does not notice, as that of a CUDA graph; here it does nothing either."""
+class Unnoticed(Recorder):
+    """Like a CUDA graph, its replay does not change the versions of tensors; here it does nothing at all."""
 
     def record(self, work: Work) -> tuple[Callable[[], None], Results]:
         return lambda: None, work()
 
 
 def test_a_replay_counts_as_a_change_of_the_weights(images: PosedImages) -> None:
-    """By their versions the fused kernels know when to pack them again."""
+    """The fused kernels pack the weights again when their versions change."""
     trainer = replaying(images, "masks", torch.device("cpu"))
-    trainer.replays.recorder = Unheard()
+    trainer.graphs.recorder = Unnoticed()
     for _ in range(3):
         before = [parameter._version for parameter in trainer.trained]
         trainer._step()
         assert all(new._version > old for new, old in zip(trainer.trained, before, strict=True))
-    assert trainer.replays.recorded > 0
+    assert trainer.graphs.recorded > 0
 
 
 def test_a_step_that_exceeds_its_capacity_is_not_taken_and_the_capacity_grows(images: PosedImages) -> None:
@@ -142,17 +149,17 @@ def test_a_step_that_exceeds_its_capacity_is_not_taken_and_the_capacity_grows(im
     assert any(not torch.equal(tensor, before[name]) for name, tensor in weights(trainer).items())
 
 
-def test_a_run_that_is_taken_up_records_anew_and_goes_on(images: PosedImages) -> None:
+def test_a_resumed_run_records_again_and_goes_on(images: PosedImages) -> None:
     trainer, other = (replaying(images, "masks", torch.device("cpu")) for _ in range(2))
     for _ in range(8):
         trainer._step()
     state = {name: tensor.clone() for name, tensor in trainer.state().items()}
     for _ in range(3):
         trainer._step()
-    assert trainer.replays.recorded > 0
+    assert trainer.graphs.recorded > 0
     for one in (trainer, other):
-        one.restore({name: tensor.clone() for name, tensor in state.items()})  # which it then works on
-        assert one.replays.recorded == 0
+        one.restore({name: tensor.clone() for name, tensor in state.items()})  # the trainer changes them in place
+        assert one.graphs.recorded == 0
         for _ in range(4):
             one._step()
     torch.testing.assert_close(weights(trainer), weights(other), rtol=0, atol=0)
