@@ -15,16 +15,16 @@ from torch import Tensor
 from ..fields.field import Field
 
 PATIENCE = 16  # steps at a gap of one `resolution`, before it doubles: few rays need as many
-BAND_ENTRY = 0.5  # depth of a step into a band unseen, in δ: steps to its edge would never arrive
+BAND_ENTRY = 0.5  # depth of a step into the next band, in δ: steps to its edge would never arrive
 BOLDNESS = 0.9  # share of the widest step that two tangent balls on a plane allow: surfaces may bend towards the ray
 STEEPEST_RISE = 0.6  # slope away from the surface above which steps grow no wider
 FLOOR = 8  # rounding errors from zero that count as zero
 
 
 class Expected(NamedTuple):
-    """Expectations of rays ``(...,)``, which set where to look first.
+    """Expectations of rays ``(...,)``, which set the depth of the first evaluation.
 
-    Where ``value`` is the fall of an even slope, the ray is evaluated at its hit at once.
+    Where ``value`` fits an even slope, the ray is evaluated at its expected hit at once.
     """
 
     depth: Tensor  # of their hits, infinite if unknown
@@ -40,7 +40,7 @@ class Near(NamedTuple):
     leave: Tensor  # the first depth evaluated behind it, infinite if there is none
 
 
-class Found:
+class RayHits:
     """Results for every ray of a call, filled in as rays end."""
 
     def __init__(self, depth: Tensor) -> None:
@@ -144,12 +144,12 @@ class Rays(NamedTuple):
         """Which rays are at their start, where nothing is known yet."""
         return self.low_value.isinf() & (self.depth == self.low)
 
-    def looked_too_far(self, value: Tensor, rule: Rule) -> Tensor:
-        """Which rays looked ahead, and are behind the surface there, at their first ``value``."""
-        # Where the hit itself was looked at, half of all that found it are behind it by less than the tolerance.
-        found = (value >= -rule.tolerance * self.fall) & (self.expected - self.depth <= rule.resolution)
+    def overshot(self, value: Tensor, rule: Rule) -> Tensor:
+        """Which rays were first evaluated ahead of their start, and are behind the surface there, by the ``value``."""
+        # Evaluated at the hit itself, half of all rays that meet it are behind it by less than the tolerance.
+        arrived = (value >= -rule.tolerance * self.fall) & (self.expected - self.depth <= rule.resolution)
         # A ray that knows the value at its start has the surface between the two.
-        return (self.depth > self.low) & (value < 0) & ~found & self.low_value.isinf()
+        return (self.depth > self.low) & (value < 0) & ~arrived & self.low_value.isinf()
 
     def began_behind(self, value: Tensor) -> Tensor:
         """Which rays are at their start, behind the surface, and may begin earlier."""
@@ -179,9 +179,9 @@ class Rule(NamedTuple):
 
 
 def march(
-    field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_steps: int, reach: float | None = None
+    field: Field, level: int, rays: Rays, hits: RayHits, rule: Rule, max_steps: int, reach: float | None = None
 ) -> None:
-    """The adaptive mode: one evaluation of every ray under way per pass, then `look`.
+    """The adaptive mode: one evaluation of every ray under way per pass, then `step`.
 
     With a ``reach``, where each ray comes so near to the surface and where it leaves it is recorded.
     """
@@ -191,23 +191,23 @@ def march(
         value = field.value(rays.points(), level=level)
         if count == 1:
             rays, value = _from_the_start(field, level, rays, value, rule)
-        if count <= 2:  # a ray that looked ahead in vain is at its start now
+        if count <= 2:  # a ray that overshot is at its start now
             rays, value = _from_the_front(field, level, rays, value)
             rays = rays._replace(sign=torch.where(rays.is_fresh() & (value < 0), -1.0, rays.sign))
         if reach is not None:
-            found.record_near(rays, (value * rays.sign < reach) | (rays.sign < 0))
+            hits.record_near(rays, (value * rays.sign < reach) | (rays.sign < 0))
         gap = rule.resolution * 2.0 ** ((count - 1) // PATIENCE)
-        rays, stand = look(rays, value * rays.sign, rule, gap)
-        ended = stand.hit | stand.passed if count < max_steps else torch.ones_like(stand.hit)
+        rays, state = step(rays, value * rays.sign, rule, gap)
+        ended = state.hit | state.passed if count < max_steps else torch.ones_like(state.hit)
         rows = ended.nonzero()[:, 0]
-        ends = Stand(*(column[rows] for column in stand))
-        found.record(rays.ray[rows], ends.hit, ends.depth, ends.level, count, ends.slope)
+        ends = RayState(*(column[rows] for column in state))
+        hits.record(rays.ray[rows], ends.hit, ends.depth, ends.level, count, ends.slope)
         rays = rays.only((~ended).nonzero()[:, 0])
 
 
 def _from_the_start(field: Field, level: int, rays: Rays, value: Tensor, rule: Rule) -> tuple[Rays, Tensor]:
-    """Send rays that looked ahead, and are behind the surface there, back to their start; with the values there."""
-    behind = rays.looked_too_far(value, rule).nonzero()[:, 0]
+    """Send rays that overshot the surface back to their start; returns the rays and the values there."""
+    behind = rays.overshot(value, rule).nonzero()[:, 0]
     if not len(behind):
         return rays, value
     rays = rays._replace(depth=rays.depth.index_copy(0, behind, rays.low[behind]))
@@ -224,8 +224,8 @@ def _from_the_front(field: Field, level: int, rays: Rays, value: Tensor) -> tupl
     return rays, value.index_copy(0, behind, field.value(rays.only(behind).points(), level=level))
 
 
-class Stand(NamedTuple):
-    """State of rays after a look at their values, ``(K,)`` each."""
+class RayState(NamedTuple):
+    """State of rays after a step, ``(K,)`` each."""
 
     hit: Tensor
     passed: Tensor
@@ -234,8 +234,8 @@ class Stand(NamedTuple):
     slope: Tensor
 
 
-def look(rays: Rays, value: Tensor, rule: Rule, resolution: Tensor | float) -> tuple[Rays, Stand]:
-    """Take in the ``value`` at ``rays.depth``, and compute where to look next."""
+def step(rays: Rays, value: Tensor, rule: Rule, resolution: Tensor | float) -> tuple[Rays, RayState]:
+    """Take in the ``value`` at ``rays.depth``, and compute the next depth to evaluate."""
     level, delta = rule.band(value.abs())
     free = ((value.abs() - delta) / rule.lipschitz).clamp(min=0)
     # Before there are two values: a hit that is expected ahead says how steep the way there is, or else it is head-on.
@@ -270,7 +270,7 @@ def look(rays: Rays, value: Tensor, rule: Rule, resolution: Tensor | float) -> t
     pinned = closed & (width <= rule.tolerance)
     landing = rays.depth + (value / steep).clamp(-rule.tolerance, rule.tolerance)
     passed = before & ~closed & (rays.depth + free + gap >= rays.far)
-    stand = Stand(
+    state = RayState(
         hit=near | pinned,
         passed=passed & ~near,
         depth=torch.where(near, landing, torch.where(pinned, chord, rays.depth)),
@@ -287,11 +287,11 @@ def look(rays: Rays, value: Tensor, rule: Rule, resolution: Tensor | float) -> t
         high_value=high_value,
         boldness=torch.where(sound | rays.low_value.isinf(), rays.boldness, rays.boldness / 2),
     )
-    return rays, stand
+    return rays, state
 
 
 def march_budget(
-    field: Field, rays: Rays, found: Found, budget: Sequence[int], tolerance: float, capture: float
+    field: Field, rays: Rays, hits: RayHits, budget: Sequence[int], tolerance: float, capture: float
 ) -> None:
     """The paper's mode: a number of steps towards the edge of each band, then towards the surface."""
     level = len(budget) - 1
@@ -309,6 +309,6 @@ def march_budget(
         inside = (rays.depth < rays.far).nonzero()[:, 0]
         gone = (rays.depth >= rays.far).nonzero()[:, 0]
         missed = torch.zeros_like(gone, dtype=torch.bool)
-        found.record(rays.ray[gone], missed, rays.depth[gone], current, steps[gone], 1.0)
+        hits.record(rays.ray[gone], missed, rays.depth[gone], current, steps[gone], 1.0)
         rays, value, steps = rays.only(inside), value[inside], steps[inside]
-    found.record(rays.ray, value.abs() < capture, rays.depth, level, steps, 1.0)
+    hits.record(rays.ray, value.abs() < capture, rays.depth, level, steps, 1.0)

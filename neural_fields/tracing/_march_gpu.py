@@ -13,15 +13,15 @@ from torch import Tensor
 
 from ..backend.fixed_shapes import first_rows, fixed_shapes
 from ..fields.field import Field
-from ._march import PATIENCE, Found, Rays, Rule, Stand, look
+from ._march import PATIENCE, RayHits, Rays, RayState, Rule, step
 
-FIRST_PASSES, PASSES = 8, 16  # before the first look, when many rays end, and between later ones
+FIRST_PASSES, PASSES = 8, 16  # before the first read by the host, when many rays end, and between later ones
 FEW, SHARE = 4096, 0.25  # first capacity of a band: this many rows, or this share of the rays if that is more
 SPARE, LEAST_CAPACITY = 1.25, 256  # later capacity: factor on the rows last requested, and the least
 
 
 def march_ahead(
-    field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_steps: int, reach: float | None = None
+    field: Field, level: int, rays: Rays, hits: RayHits, rule: Rule, max_steps: int, reach: float | None = None
 ) -> None:
     """`march`, with one wait after the first `FIRST_PASSES` passes, and then every `PASSES`."""
     count = torch.zeros_like(rays.ray)
@@ -29,7 +29,7 @@ def march_ahead(
     passes = FIRST_PASSES
     while len(rays.ray) and max_steps > 0:
         chunk = _Chunk(field, level, rays, count, rule, max_steps)
-        requested = chunk.run(passes, found, reach, capacity)
+        requested = chunk.run(passes, hits, reach, capacity)
         left, *counts = torch.stack([(~chunk.ended).sum(), *requested]).tolist()  # the only wait of the host
         rows = first_rows(~chunk.ended, left)
         rays, count = chunk.rays.only(rows), chunk.count[rows]
@@ -44,16 +44,16 @@ class _Chunk:
         rays: see `Rays`; those that have ended stay where they were.
         count: ``(K,)`` evaluations of each.
         ended: ``(K,)`` bool.
-        stand: state of each when it ended.
+        state: state of each when it ended.
     """
 
     def __init__(self, field: Field, level: int, rays: Rays, count: Tensor, rule: Rule, max_steps: int) -> None:
         self.field, self.level, self.rule, self.max_steps = field, level, rule, max_steps
         self.rays, self.count = rays, count
         self.ended = torch.zeros_like(count, dtype=torch.bool)
-        self.stand = Stand(self.ended, self.ended, rays.depth, count, torch.ones_like(rays.depth))
+        self.state = RayState(self.ended, self.ended, rays.depth, count, torch.ones_like(rays.depth))
 
-    def run(self, passes: int, found: Found, reach: float | None, capacity: Sequence[int]) -> list[Tensor]:
+    def run(self, passes: int, hits: RayHits, reach: float | None, capacity: Sequence[int]) -> list[Tensor]:
         """Do ``passes`` passes, record the rays that ended, and return the requested capacity of each band."""
         requested: list[Tensor] = []
         if self.field.same_rows:
@@ -62,24 +62,24 @@ class _Chunk:
                     shapes.mask = ~self.ended
                     value = self._values()
                     self._pass(
-                        value, shapes.mask if shapes.overflow is None else shapes.mask & ~shapes.overflow, found, reach
+                        value, shapes.mask if shapes.overflow is None else shapes.mask & ~shapes.overflow, hits, reach
                     )
             requested = shapes.requested
         else:  # a field that is evaluated at other rows could not tell which rows overflow
             for _ in range(passes):
-                self._pass(self._values(), ~self.ended, found, reach)
-        stand = self.stand
-        found.record(self.rays.ray, stand.hit, stand.depth, stand.level, self.count, stand.slope)
+                self._pass(self._values(), ~self.ended, hits, reach)
+        state = self.state
+        hits.record(self.rays.ray, state.hit, state.depth, state.level, self.count, state.slope)
         return requested
 
     def _values(self) -> Tensor:
         return self.field.value(self.rays.points(), level=self.level)
 
-    def _pass(self, value: Tensor, there: Tensor, found: Found, reach: float | None) -> None:
+    def _pass(self, value: Tensor, there: Tensor, hits: RayHits, reach: float | None) -> None:
         """Let the rays that are ``there`` take in their values."""
         rays = self.rays
-        # A ray that is behind the surface where it began goes back, and looks again as if for the first time.
-        back = there & (self.count == 0) & rays.looked_too_far(value, self.rule)
+        # A ray that is behind the surface at its first value goes back, and begins again.
+        back = there & (self.count == 0) & rays.overshot(value, self.rule)
         early = there & (self.count <= 1) & ~back
         front = early & rays.began_behind(value)
         low = torch.where(front, rays.entry, rays.low)
@@ -88,13 +88,13 @@ class _Chunk:
         sign = torch.where(early & there & rays.is_fresh() & (value < 0), -1.0, rays.sign)
         rays = rays._replace(sign=sign)
         if reach is not None:
-            found.record_near(rays, (value * sign < reach) | (sign < 0), there)
+            hits.record_near(rays, (value * sign < reach) | (sign < 0), there)
         doublings = (self.count // PATIENCE).clamp(max=60)  # more than any ray sees; a longer shift would overflow
         gap = self.rule.resolution * torch.bitwise_left_shift(torch.ones_like(doublings), doublings).to(value.dtype)
-        moved, stand = look(rays, value * sign, self.rule, gap)
+        moved, state = step(rays, value * sign, self.rule, gap)
         self.count = self.count + there
-        ends = there & (stand.hit | stand.passed | (self.count >= self.max_steps))
-        self.stand = Stand(*(torch.where(ends, new, old) for new, old in zip(stand, self.stand, strict=True)))
+        ends = there & (state.hit | state.passed | (self.count >= self.max_steps))
+        self.state = RayState(*(torch.where(ends, new, old) for new, old in zip(state, self.state, strict=True)))
         self.ended = self.ended | ends
         self.rays = Rays(
             *(old if new is old else torch.where(there, new, old) for new, old in zip(moved, rays, strict=True))

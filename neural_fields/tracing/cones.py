@@ -162,12 +162,12 @@ def _until_all_stop(
     """Advance the rows that are ``going`` ``(K,)`` until none is, at most ``max_steps`` times.
 
     ``advance`` maps the ``fixed`` and ``moving`` columns ``(K, …)`` and the going to the next moving, and to which go
-    on. A CPU looks after each step and leaves out stopped rows; an accelerator is read as rarely as in `_march_gpu`.
+    on. A CPU drops stopped rows after each step; an accelerator is read as rarely as in `_march_gpu`.
     """
-    looked, steps = not makes_wait(going.device), 0
-    chunk, left = (1, int(going.sum())) if looked else (FIRST_PASSES, len(going))
+    on_cpu, steps = not makes_wait(going.device), 0
+    chunk, left = (1, int(going.sum())) if on_cpu else (FIRST_PASSES, len(going))
     while left and steps < max_steps:
-        rows = going.nonzero()[:, 0] if looked else first_rows(going, left)
+        rows = going.nonzero()[:, 0] if on_cpu else first_rows(going, left)
         if left == len(going):
             rows = torch.arange(left, device=going.device)
         here, part, on = tuple(column[rows] for column in fixed), tuple(column[rows] for column in moving), going[rows]
@@ -178,7 +178,7 @@ def _until_all_stop(
         moving = tuple(column.index_copy(0, rows, new) for column, new in zip(moving, part, strict=True))
         going = going.index_copy(0, rows, on)
         steps, left = steps + chunk, int(on.sum())
-        chunk = 1 if looked else PASSES
+        chunk = 1 if on_cpu else PASSES
     return moving
 
 

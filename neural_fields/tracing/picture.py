@@ -155,7 +155,7 @@ def count_hits(mask, counts, count, PIXELS: tl.constexpr):
 
 @triton.jit
 def place_hits(
-    origin, directions, mask, found_depth, counts, hits, pixels, depths, positions, count,
+    origin, directions, mask, hit_depth, counts, hits, pixels, depths, positions, count,
     PROGRAMS: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
     """Rows of the pixels that see the surface, in their order, and how many there are."""
@@ -165,13 +165,13 @@ def place_hits(
     other = tl.arange(0, PROGRAMS)
     first = tl.sum(tl.load(counts + other, mask=other < program, other=0), axis=0)
     row = first + tl.cumsum(hit, axis=0) - 1
-    seen = hit > 0
-    depth = tl.load(found_depth + pixel, mask=seen, other=0.0)
-    tl.store(pixels + row, pixel.to(tl.int64), mask=seen)
-    tl.store(depths + row, depth, mask=seen)
+    visible = hit > 0
+    depth = tl.load(hit_depth + pixel, mask=visible, other=0.0)
+    tl.store(pixels + row, pixel.to(tl.int64), mask=visible)
+    tl.store(depths + row, depth, mask=visible)
     for axis in tl.static_range(3):
-        d = tl.load(directions + pixel * 3 + axis, mask=seen, other=0.0)
-        tl.store(positions + row * 3 + axis, tl.load(origin + axis) + depth * d, mask=seen)
+        d = tl.load(directions + pixel * 3 + axis, mask=visible, other=0.0)
+        tl.store(positions + row * 3 + axis, tl.load(origin + axis) + depth * d, mask=visible)
     tl.store(hits, first + tl.sum(hit, axis=0), mask=program == tl.num_programs(0) - 1)
 
 
@@ -253,7 +253,7 @@ class Picture:
             *(torch.empty(count, **numbers) for _ in range(3)),
         )
         self.queue = Queue(torch.empty(count, **whole), torch.zeros(2, **whole))
-        self.found = Marched.nothing(torch.empty(count, **numbers))
+        self.marched = Marched.nothing(torch.empty(count, **numbers))
         self.counts, self.hits = torch.zeros(programs, **whole), torch.zeros(1, **whole)
         self.values, self.gradients = torch.empty(count, **numbers), torch.empty(count, 3, **numbers)
         self.margin = traced.deltas[:1] if len(traced.networks) > 1 else torch.zeros(1, **numbers)
@@ -313,17 +313,17 @@ class Picture:
                 )
                 larger = side
             begin_rays[grid](
-                free, entries, ends, starts, *self.queue, self.found.mask, width, count,
+                free, entries, ends, starts, *self.queue, self.marched.mask, width, count,
                 SIDE=larger, PIXELS=PROGRAM_PIXELS,
             )  # fmt: skip
             march_fused(
-                self.traced, self.rays, self.queue, self.found, view[16:19],
+                self.traced, self.rays, self.queue, self.marched, view[16:19],
                 max_steps=setting.max_steps, constants=dict(setting.march),
             )  # fmt: skip
-            count_hits[grid](self.found.mask, self.counts, count, PIXELS=PROGRAM_PIXELS)
+            count_hits[grid](self.marched.mask, self.counts, count, PIXELS=PROGRAM_PIXELS)
             place_hits[grid](
-                origins, directions, self.found.mask, self.found.depth, self.counts, self.hits, *self.drawn[:3], count,
-                PROGRAMS=triton.next_power_of_2(grid[0]), PIXELS=PROGRAM_PIXELS,
+                origins, directions, self.marched.mask, self.marched.depth, self.counts, self.hits, *self.drawn[:3],
+                count, PROGRAMS=triton.next_power_of_2(grid[0]), PIXELS=PROGRAM_PIXELS,
             )  # fmt: skip
             walk_rows(self.drawn.position, self.shown, self.values, self.gradients, count=self.hits, jet=True)
             see_hits[grid](

@@ -26,8 +26,8 @@ from ._march import (
     PATIENCE,
     STEEPEST_RISE,
     Expected,
-    Found,
     Near,
+    RayHits,
     Rays,
     Rule,
     march,
@@ -79,7 +79,7 @@ def sphere_trace(
     The default mode runs until every depth is known to ``tolerance``. Steps are the widest that leave no gap between
     the balls around two samples if the surface is a plane (Bálint and Valasek 2018); where a gap opens, the step is
     taken back. The resolution doubles after every 16 steps of a ray. A change of sign is closed in on by the secant
-    rule and bisection in turn. A ray that starts inside the surface looks for the way out.
+    rule and bisection in turn. A ray that starts inside the surface is traced to its exit.
 
     With a ``budget``, the paper's mode: that many steps ``t ← t + f_j − δ_j`` on each level (20, 5, 5 in its Tab. 4),
     after which |f| < ``capture`` is a hit.
@@ -161,9 +161,9 @@ def _trace_budget(
     if bool((field.deltas[:level].isinf().cpu() & (torch.tensor(budget[:level]) > 0)).any()):
         raise ValueError(f"budget={list(budget)}: a level without a band leads to no other; give it 0 steps")
     directions, length = unit_directions(directions)
-    spans, found = _begin(origins, directions, length, near, far, radius)
-    march_budget(field, Rays.begin(*spans), found, budget, tolerance, capture)
-    return _hits(found, origins, directions, length)
+    spans, hits = _begin(origins, directions, length, near, far, radius)
+    march_budget(field, Rays.begin(*spans), hits, budget, tolerance, capture)
+    return _hits(hits, origins, directions, length)
 
 
 @torch.no_grad()
@@ -185,10 +185,10 @@ def trace_expected(
 ) -> tuple[Hits, Tensor, Near]:
     """`sphere_trace` in the default mode, with expected depths and slopes of the hits, and values at ``near``, if any.
 
-    A ray first looks so near to its expected hit that the ball there just reaches back to ``near``. Where the field
-    does not fall as expected, the ray finds a gap between its balls, or itself behind the surface, and goes back: wrong
-    depths and slopes only cost steps. But a ``value`` is trusted: where it implies an even fall from ``near`` to the
-    hit, nothing else is looked for in between.
+    A ray is first evaluated so near to its expected hit that the ball there just reaches back to ``near``. Where the
+    field does not fall as expected, there is a gap between the balls, or the point lies behind the surface. Then the
+    ray goes back: wrong depths and slopes only cost steps. But a ``value`` is trusted: where it implies an even fall
+    from ``near`` to the hit, no other hit is searched for in between.
 
     Returns the hits, how fast the field fell along each ray at its last step ``(...,)``, and, with a ``reach``, where
     the ray came within it of the surface.
@@ -197,22 +197,22 @@ def trace_expected(
     check_rays(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
     rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
     directions, length = unit_directions(directions)
-    spans, found = _begin(origins, directions, length, near, far, radius)
+    spans, hits = _begin(origins, directions, length, near, far, radius)
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
     if expected is None and reach is None and choose_levels(levels_of(field)[: level + 1], directions, jet=False).fused:
-        _march_fused(field, level, spans, found, rule, max_steps)
-        unknown = Near(*(column.reshape(shape) for column in found.near))
-        return _hits(found, origins, directions, length), found.slope.reshape(shape), unknown
+        _march_fused(field, level, spans, hits, rule, max_steps)
+        unknown = Near(*(column.reshape(shape) for column in hits.near))
+        return _hits(hits, origins, directions, length), hits.slope.reshape(shape), unknown
     rays = Rays.begin(*spans)
     if expected is not None:
         depth, slope, value = (part.to(directions).broadcast_to(shape) for part in expected)
         flat = Expected((depth * length).reshape(-1), slope.reshape(-1), value.reshape(-1))
         rays = rays.expecting(flat, rule)
     go = march_ahead if makes_wait(directions.device) else march
-    go(field, level, rays, found, rule, max_steps, reach)
-    clear, value, leave = (column.reshape(shape) for column in found.near)
+    go(field, level, rays, hits, rule, max_steps, reach)
+    clear, value, leave = (column.reshape(shape) for column in hits.near)
     near_surface = Near(clear / length, value, leave / length)
-    return _hits(found, origins, directions, length), found.slope.reshape(shape), near_surface
+    return _hits(hits, origins, directions, length), hits.slope.reshape(shape), near_surface
 
 
 def march_constants(dtype: torch.dtype) -> dict[str, float]:
@@ -226,7 +226,7 @@ def march_constants(dtype: torch.dtype) -> dict[str, float]:
     }
 
 
-def _march_fused(field: Field, level: int, spans: tuple[Tensor, ...], found: Found, rule: Rule, max_steps: int) -> None:
+def _march_fused(field: Field, level: int, spans: Sequence[Tensor], hits: RayHits, rule: Rule, max_steps: int) -> None:
     """`march` by the fused kernels, with the same bounds, but for the last bits."""
     from ..backend.kernels.paths import march_fused
     from ..backend.kernels.tracing import Marched, Queue, RayTensors
@@ -235,17 +235,17 @@ def _march_fused(field: Field, level: int, spans: tuple[Tensor, ...], found: Fou
     if not len(starts):
         return
     levels = as_levels(field, level)
-    marched, queue = Marched.nothing(found.depth), Queue.of(starts, ends)
+    marched, queue = Marched.nothing(hits.depth), Queue.of(starts, ends)
     numbers = starts.new_tensor([rule.tolerance, rule.resolution, rule.lipschitz])
     rays = RayTensors(origins, directions, starts, entries, ends)
     march_fused(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=march_constants(starts.dtype))
     mask, depth, steps, slope, own = marched.in_own_types()
-    found.mask, found.depth, found.level, found.steps, found.slope = mask, depth, own, steps, slope
+    hits.mask, hits.depth, hits.level, hits.steps, hits.slope = mask, depth, own, steps, slope
 
 
 def _begin(
     origins: Tensor, directions: Tensor, length: Tensor, near: Tensor | float, far: Tensor | float, radius: float | None
-) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor], Found]:
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor], RayHits]:
     """Flat rays, as `Rays.begin` takes them, inside the ball of ``radius``; and memory for their results.
 
     Directions are of unit length; ``near`` and ``far`` count in the ``length`` that they had.
@@ -258,7 +258,7 @@ def _begin(
     if radius is not None:
         entry, leave = ball_crossing(origins, directions, radius)
         entries, ends = entry.clamp(min=0), torch.minimum(ends, leave)
-    return (origins, directions, entries, torch.maximum(starts, entries), ends), Found(starts)
+    return (origins, directions, entries, torch.maximum(starts, entries), ends), RayHits(starts)
 
 
 def _like(number: Tensor | float, other: Tensor) -> Tensor:
@@ -266,13 +266,13 @@ def _like(number: Tensor | float, other: Tensor) -> Tensor:
     return number.to(other) if isinstance(number, Tensor) else other.new_full((), number)
 
 
-def _hits(found: Found, origins: Tensor, directions: Tensor, length: Tensor) -> Hits:
+def _hits(hits: RayHits, origins: Tensor, directions: Tensor, length: Tensor) -> Hits:
     """Results in the shape of the rays; see `_begin`."""
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
-    depth = found.depth.reshape(shape)
+    depth = hits.depth.reshape(shape)
     position = origins + depth[..., None] * directions
     return Hits(
-        found.mask.reshape(shape), depth / length, position, found.level.reshape(shape), found.steps.reshape(shape)
+        hits.mask.reshape(shape), depth / length, position, hits.level.reshape(shape), hits.steps.reshape(shape)
     )
 
 

@@ -2,7 +2,7 @@
 
 Each program has SLOTS places for rays, a ring of free ones, and for each level a ring of those that wait for its value.
 Free places take the next rays of a queue that all programs share. A program serves its longest ring, up to ROWS rays at
-a time. A value in the next band sends its ray to the ring of the next level. Any other goes through `look_at`, after
+a time. A value in the next band sends its ray to the ring of the next level. Any other goes through `advance`, after
 which the ray has ended or goes back to level 0. So tiles of every level stay full. The state of rays lies in a scratch
 of the program's own. The rules are those of `sphere_trace` without expectations; see `tracing.py`.
 """
@@ -22,7 +22,7 @@ from . import tracing
 from .launch import half_scratch, launch
 from .levels import Levels, gate_of, level_of_tile
 from .tensor_tiles import keep
-from .tracing import Marched, Queue, RayTensors, first_band, look_at, turned_back
+from .tracing import Marched, Queue, RayTensors, advance, first_band, turned_back
 
 # Rays under way in a program: more fill the tiles, fewer shorten the end. Twice as many above MANY_RAYS rays in all.
 SLOTS, MANY_RAYS = 256, 1 << 19
@@ -50,8 +50,8 @@ def put(rings, heads, lengths, INDEX: tl.constexpr, entry, chosen, place, SLOTS:
 @triton.jit
 def serve(
     LEVEL: tl.constexpr,
-    heads, lengths, weights, origins, directions, entries, ends, floats, halves, deltas, found_mask, found_depth,
-    found_steps, found_slope, found_level, kept, rings, scratch, tolerance, resolution, lipschitz, max_steps, taper,
+    heads, lengths, weights, origins, directions, entries, ends, floats, halves, deltas, hit_mask, hit_depth,
+    hit_steps, hit_slope, hit_level, kept, rings, scratch, tolerance, resolution, lipschitz, max_steps, taper,
     PATIENCE: tl.constexpr, BOLDNESS: tl.constexpr, STEEPEST_RISE: tl.constexpr, BAND_ENTRY: tl.constexpr,
     FLOOR: tl.constexpr, ORIGIN: tl.constexpr, TAPERED: tl.constexpr, SHAPES: tl.constexpr, SLOTS: tl.constexpr,
     ROWS: tl.constexpr,
@@ -87,37 +87,37 @@ def serve(
     deeper = there & (line < 0)
     if LEVEL < LEVELS - 1:
         deeper = there & (tl.abs(raw) < tl.load(deltas + LEVEL))
-    seen = there & (deeper == 0)
+    final = there & (deeper == 0)
 
-    far = tl.load(ends + ray, mask=seen, other=0.0)
-    entry = tl.load(entries + ray, mask=seen, other=0.0)
-    low = tl.load(kept + 2 * SLOTS + slot, mask=seen, other=0.0)
-    low_value = tl.load(kept + 3 * SLOTS + slot, mask=seen, other=0.0)
-    free = tl.load(kept + 4 * SLOTS + slot, mask=seen, other=0.0)
-    gap = tl.load(kept + 5 * SLOTS + slot, mask=seen, other=0.0)
-    high = tl.load(kept + 6 * SLOTS + slot, mask=seen, other=0.0)
-    high_value = tl.load(kept + 7 * SLOTS + slot, mask=seen, other=0.0)
-    boldness = tl.load(kept + 8 * SLOTS + slot, mask=seen, other=0.0)
-    sign = tl.load(kept + 9 * SLOTS + slot, mask=seen, other=0.0)
-    steps = tl.load(taken + slot, mask=seen, other=0)
+    far = tl.load(ends + ray, mask=final, other=0.0)
+    entry = tl.load(entries + ray, mask=final, other=0.0)
+    low = tl.load(kept + 2 * SLOTS + slot, mask=final, other=0.0)
+    low_value = tl.load(kept + 3 * SLOTS + slot, mask=final, other=0.0)
+    free = tl.load(kept + 4 * SLOTS + slot, mask=final, other=0.0)
+    gap = tl.load(kept + 5 * SLOTS + slot, mask=final, other=0.0)
+    high = tl.load(kept + 6 * SLOTS + slot, mask=final, other=0.0)
+    high_value = tl.load(kept + 7 * SLOTS + slot, mask=final, other=0.0)
+    boldness = tl.load(kept + 8 * SLOTS + slot, mask=final, other=0.0)
+    sign = tl.load(kept + 9 * SLOTS + slot, mask=final, other=0.0)
+    steps = tl.load(taken + slot, mask=final, other=0)
 
     back, sign = turned_back(raw, depth, entry, low, low_value, sign)
-    looks = seen & (back == 0)
-    steps = tl.where(looks, steps + 1, steps)
+    stepping = final & (back == 0)
+    steps = tl.where(stepping, steps + 1, steps)
     value = raw * sign
     level_there, delta = first_band(value, deltas, LEVELS)
-    ahead, low, low_value, free, gap, high, high_value, boldness, hit, passed, end, slope = look_at(
+    ahead, low, low_value, free, gap, high, high_value, boldness, hit, passed, end, slope = advance(
         value, delta, depth, far, low, low_value, free, gap, high, high_value, boldness, steps,
         tolerance, resolution, lipschitz, PATIENCE, BOLDNESS, STEEPEST_RISE, BAND_ENTRY, FLOOR,
     )  # fmt: skip
-    ended = looks & (hit | passed | (steps >= max_steps))
-    tl.store(found_mask + ray, hit.to(tl.int8), mask=ended)
-    tl.store(found_depth + ray, end, mask=ended)
-    tl.store(found_steps + ray, steps, mask=ended)
-    tl.store(found_slope + ray, slope, mask=ended)
-    tl.store(found_level + ray, level_there, mask=ended)
+    ended = stepping & (hit | passed | (steps >= max_steps))
+    tl.store(hit_mask + ray, hit.to(tl.int8), mask=ended)
+    tl.store(hit_depth + ray, end, mask=ended)
+    tl.store(hit_steps + ray, steps, mask=ended)
+    tl.store(hit_slope + ray, slope, mask=ended)
+    tl.store(hit_level + ray, level_there, mask=ended)
 
-    left = seen & (ended == 0)
+    left = final & (ended == 0)
     went_on = left & (back == 0)
     tl.store(kept + SLOTS + slot, tl.where(back, entry, ahead), mask=left)
     tl.store(kept + 2 * SLOTS + slot, tl.where(back, entry, low), mask=left)
@@ -147,8 +147,8 @@ def serve(
 
 @triton.jit(do_not_specialize=["max_steps"])
 def march_bands(
-    origins, directions, starts, entries, ends, listed, queue, floats, halves, deltas, found_mask, found_depth,
-    found_steps, found_slope, found_level, columns, counts, scratch, numbers, max_steps, taper,
+    origins, directions, starts, entries, ends, listed, queue, floats, halves, deltas, hit_mask, hit_depth,
+    hit_steps, hit_slope, hit_level, columns, counts, scratch, numbers, max_steps, taper,
     PATIENCE: tl.constexpr, BOLDNESS: tl.constexpr, STEEPEST_RISE: tl.constexpr, BAND_ENTRY: tl.constexpr,
     FLOOR: tl.constexpr, ORIGIN: tl.constexpr, TAPERED: tl.constexpr, SHAPES: tl.constexpr, SCRATCH: tl.constexpr,
     COLUMNS: tl.constexpr, COUNTS: tl.constexpr, SLOTS: tl.constexpr, ROWS: tl.constexpr,
@@ -214,7 +214,7 @@ def march_bands(
         for _once in range((turn == 0).to(tl.int32)):
             heads, lengths = serve(
                 0, heads, lengths, weights, origins, directions, entries, ends, floats, halves, deltas,
-                found_mask, found_depth, found_steps, found_slope, found_level, kept, rings, own,
+                hit_mask, hit_depth, hit_steps, hit_slope, hit_level, kept, rings, own,
                 tolerance, resolution, lipschitz, max_steps, taper,
                 PATIENCE, BOLDNESS, STEEPEST_RISE, BAND_ENTRY, FLOOR, ORIGIN, TAPERED, SHAPES, SLOTS, ROWS,
             )  # fmt: skip
@@ -222,7 +222,7 @@ def march_bands(
             if turn == level:
                 heads, lengths = serve(
                     level, heads, lengths, (), origins, directions, entries, ends, floats, halves, deltas,
-                    found_mask, found_depth, found_steps, found_slope, found_level, kept, rings, own,
+                    hit_mask, hit_depth, hit_steps, hit_slope, hit_level, kept, rings, own,
                     tolerance, resolution, lipschitz, max_steps, taper,
                     PATIENCE, BOLDNESS, STEEPEST_RISE, BAND_ENTRY, FLOOR, ORIGIN, TAPERED, SHAPES, SLOTS, ROWS,
                 )  # fmt: skip
@@ -233,7 +233,7 @@ def march_fused(
     levels: Levels,
     rays: RayTensors,
     queue: Queue,
-    found: Marched,
+    marched: Marched,
     numbers: Tensor,
     *,
     max_steps: int,
@@ -242,14 +242,14 @@ def march_fused(
     """`march_rays` for one network that leaves registers for rays, `march_levels` for all others."""
     alone = len(levels.networks) == 1 and levels.networks[0].shape.width <= tracing.IN_REGISTERS
     march = tracing.march_rays if alone else march_levels
-    march(levels, rays, queue, found, numbers, max_steps=max_steps, constants=constants)
+    march(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=constants)
 
 
 def march_levels(
     levels: Levels,
     rays: RayTensors,
     queue: Queue,
-    found: Marched,
+    marched: Marched,
     numbers: Tensor,
     *,
     max_steps: int,
@@ -259,7 +259,7 @@ def march_levels(
     kept, like, rows = levels.scratch(jet=False), rays.starts, levels.rows
     # Numbers of a ray: value so far, depth, low, low_value, free, gap, high, high_value, boldness, sign.
     floats = 10
-    whole = 2  # its number, and how often it was looked at
+    whole = 2  # its number, and its number of steps
     slots = SLOTS if len(like) <= MANY_RAYS else 2 * SLOTS
 
     def arguments(programs: int) -> tuple[object, ...]:
@@ -268,7 +268,7 @@ def march_levels(
             programs * slots * (len(levels.networks) + 1 + whole), dtype=torch.int32, device=like.device
         )
         scratch = half_scratch(like, programs * kept)
-        return *rays, *queue, *levels.arguments(), *found, columns, counts, scratch, numbers, max_steps, levels.taper
+        return *rays, *queue, *levels.arguments(), *marched, columns, counts, scratch, numbers, max_steps, levels.taper
 
     launch(
         march_bands,

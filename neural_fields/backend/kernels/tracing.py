@@ -1,7 +1,7 @@
 """Rays that march through one network in one launch: each stays in registers until it meets the surface or leaves.
 
 `tracing._march` has some seventy small operations between evaluations; on a GPU each is a launch. Here a program
-marches ROWS rays at a time: a value of its tile, then the rules of `tracing._march.look` in registers. A ray that ends
+marches ROWS rays at a time: a value of its tile, then the rules of `tracing._march.step` in registers. A ray that ends
 writes its results, and the next ray of a queue, shared by all programs, takes its place.
 
 The rules are those of `sphere_trace` for a field without bands and without expectations. Decisions are the same; values
@@ -100,7 +100,7 @@ def turned_back(raw, depth, entry, low, low_value, sign):
 
 
 @triton.jit
-def look_at(
+def advance(
     value, delta, depth, far, low, low_value, free, gap, high, high_value, boldness, steps, tolerance, resolution,
     lipschitz,
     PATIENCE: tl.constexpr, BOLDNESS: tl.constexpr, STEEPEST_RISE: tl.constexpr, BAND_ENTRY: tl.constexpr,
@@ -159,8 +159,8 @@ def look_at(
 
 @triton.jit(do_not_specialize=["max_steps"])
 def march(
-    origins, directions, starts, entries, ends, listed, queue, floats, halves, found_mask, found_depth, found_steps,
-    found_slope, scratch, exchanged, numbers, max_steps,
+    origins, directions, starts, entries, ends, listed, queue, floats, halves, hit_mask, hit_depth, hit_steps,
+    hit_slope, scratch, exchanged, numbers, max_steps,
     PATIENCE: tl.constexpr, BOLDNESS: tl.constexpr, STEEPEST_RISE: tl.constexpr, BAND_ENTRY: tl.constexpr,
     FLOOR: tl.constexpr, ORIGIN: tl.constexpr, SHAPE: tl.constexpr, SCRATCH: tl.constexpr, ROWS: tl.constexpr,
     REFILL: tl.constexpr,
@@ -216,23 +216,23 @@ def march(
         raw = tl.load(cell)
 
         sent_back, sign = turned_back(raw, depth, entry, low, low_value, sign)
-        looks = under_way & (sent_back == 0)
-        steps = tl.where(looks, steps + 1, steps)
-        ahead, new_low, new_low_value, new_free, wide, new_high, new_high_value, bold, hit, passed, end, fall = look_at(
+        stepping = under_way & (sent_back == 0)
+        steps = tl.where(stepping, steps + 1, steps)
+        ahead, new_low, new_low_value, new_free, wide, new_high, new_high_value, bold, hit, passed, end, fall = advance(
             raw * sign, 0.0, depth, far, low, low_value, free, gap, high, high_value, boldness, steps,
             tolerance, resolution, lipschitz, PATIENCE, BOLDNESS, STEEPEST_RISE, BAND_ENTRY, FLOOR,
         )  # fmt: skip
-        ended = looks & (hit | passed | (steps >= max_steps))
-        tl.store(found_mask + ray, hit.to(tl.int8), mask=ended)
-        tl.store(found_depth + ray, end, mask=ended)
-        tl.store(found_steps + ray, steps, mask=ended)
-        tl.store(found_slope + ray, fall, mask=ended)
+        ended = stepping & (hit | passed | (steps >= max_steps))
+        tl.store(hit_mask + ray, hit.to(tl.int8), mask=ended)
+        tl.store(hit_depth + ray, end, mask=ended)
+        tl.store(hit_steps + ray, steps, mask=ended)
+        tl.store(hit_slope + ray, fall, mask=ended)
 
-        depth = tl.where(looks, ahead, tl.where(sent_back, entry, depth))
-        low = tl.where(looks, new_low, tl.where(sent_back, entry, low))
-        low_value, free = tl.where(looks, new_low_value, low_value), tl.where(looks, new_free, free)
-        high, high_value = tl.where(looks, new_high, high), tl.where(looks, new_high_value, high_value)
-        boldness, gap = tl.where(looks, bold, boldness), tl.where(looks, wide, gap)
+        depth = tl.where(stepping, ahead, tl.where(sent_back, entry, depth))
+        low = tl.where(stepping, new_low, tl.where(sent_back, entry, low))
+        low_value, free = tl.where(stepping, new_low_value, low_value), tl.where(stepping, new_free, free)
+        high, high_value = tl.where(stepping, new_high, high), tl.where(stepping, new_high_value, high_value)
+        boldness, gap = tl.where(stepping, bold, boldness), tl.where(stepping, wide, gap)
         free_place = tl.where(ended, 1, free_place)
         left = tl.sum(free_place, axis=0)
         tl.debug_barrier()  # all have read their values
@@ -243,7 +243,7 @@ def march_rays(
     levels: Levels,
     rays: RayTensors,
     queue: Queue,
-    found: Marched,
+    marched: Marched,
     numbers: Tensor,
     *,
     max_steps: int,
@@ -252,7 +252,7 @@ def march_rays(
     """March the rays of a queue to the surface of one three-dimensional network up to 128 units wide.
 
     ``numbers`` ``(3,)`` are tolerance, resolution and Lipschitz constant of `sphere_trace`, on the device;
-    ``constants`` are those of `march_constants`. Results go to ``found``; the state of the queue changes.
+    ``constants`` are those of `march_constants`. Results go to ``marched``; the state of the queue changes.
     """
     (network,) = levels.networks
     rows = network.shape.rows
@@ -262,7 +262,7 @@ def march_rays(
         rays.starts,
         triton.cdiv(len(rays.starts), rows),
         lambda programs: (
-            *rays, *queue, network.floats, network.halves, *found[:4],
+            *rays, *queue, network.floats, network.halves, *marched[:4],
             half_scratch(rays.starts, programs * kept),
             torch.empty(programs * rows, dtype=torch.float32, device=rays.starts.device), numbers, max_steps,
         ),

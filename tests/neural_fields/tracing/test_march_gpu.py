@@ -1,4 +1,4 @@
-"""The march that runs ahead of the host, on the CPU, against the one that looks after every pass."""
+"""The march that runs ahead of the host, on the CPU, against the one that reads after every pass."""
 
 from unittest import mock
 

@@ -121,7 +121,7 @@ def test_any_number_of_rays_and_levels_in_range(count: int, place: torch.device,
 
 @pytest.mark.parametrize("taper", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_rays_through_bands_end_where_pytorchs_do(taper: float, place: torch.device, counted: list[int]) -> None:
-    """Some begin inside, and look for the way out; some are told to begin behind the surface, and go back."""
+    """Some begin inside, and are traced to their exit; some start behind the surface, and go back."""
     field, (origins, directions) = waves(place, taper), rays(20, place, aim=0.3)
     origins[:4] *= 0.1
     near = torch.where(torch.arange(20, device=place) < 16, 0.0, 1.2)
