@@ -103,7 +103,7 @@ class SceneModel(nn.Module):
         return model.requires_grad_(False)
 
     def radiance(self) -> Radiance:
-        """What rays see of the geometry; without exposures and poses, which are the photographs'."""
+        """The `Radiance` of the scene, without the exposures and poses of its photographs."""
         return Radiance(self.color, self.outside, self.background, float(self.inv_std.detach()))
 
     @property
@@ -118,18 +118,18 @@ class SceneModel(nn.Module):
             width = (band / inv_std.to(precise(inv_std.device))).clamp(min=least)
             self.geometry.deltas.copy_(width.expand_as(self.geometry.deltas))
 
-    def photographed(self, seen: Rendered, view: Tensor) -> Tensor:
-        """Colours ``(R, 3)`` of rendered rays as photographs with the numbers ``view`` ``(R,)`` show them.
+    def photographed(self, rendered: Rendered, view: Tensor) -> Tensor:
+        """Colours ``(R, 3)`` of rendered rays with the exposures of the photographs with numbers ``view`` ``(R,)``.
 
-        A background that is known has the same colour in all of them; one that is learnt is a part of the photograph.
+        A known background has the same colour in all photographs; a learnt one has their exposures too.
         """
         if self.exposures is None:
-            return seen.color
+            return rendered.color
         gain, offset = (part.index_select(0, view) for part in self.exposures())
         if self.outside is not None:
-            return gain * seen.color + offset
-        behind = (1 - seen.opacity)[:, None] * self.background
-        return gain * (seen.color - behind) + seen.opacity[:, None] * offset + behind
+            return gain * rendered.color + offset
+        behind = (1 - rendered.opacity)[:, None] * self.background
+        return gain * (rendered.color - behind) + rendered.opacity[:, None] * offset + behind
 
     def render(
         self,
@@ -139,10 +139,10 @@ class SceneModel(nn.Module):
         *,
         cos_anneal: Tensor | float = 1.0,
         level: int = -1,
-        least_weight: float = 0.0,
-        skip: float = 0.0,
+        early_stop_eps: float = 0.0,
+        alpha_threshold: float = 0.0,
         skip_share: float = 0.0,
-        guide: Callable[[Tensor], Tensor] | None = None,
+        sdf_grid: Callable[[Tensor], Tensor] | None = None,
         generator: torch.Generator | None = None,
     ) -> Rendered:
         """`render_volume` of this scene, with colours in half precision on a GPU."""
@@ -162,10 +162,10 @@ class SceneModel(nn.Module):
             level=level,
             background=self.background,
             outside=self.outside,
-            early_stop_eps=least_weight,
-            alpha_threshold=skip,
+            early_stop_eps=early_stop_eps,
+            alpha_threshold=alpha_threshold,
             skip_share=skip_share,
-            sdf_grid=guide,
+            sdf_grid=sdf_grid,
             generator=generator,
         )
 
@@ -259,10 +259,10 @@ class RayPool:
             near, far = sphere_span(*camera_rays(camera))
             hit = far > near
             hits += int(hit.sum())
-            wanted = torch.ones_like(hit) if whole else hit
+            chosen = torch.ones_like(hit) if whole else hit
             if left_out and index in left_out:
-                wanted = wanted & ~torch.from_numpy(left_out[index].reshape(-1))
-            kept = wanted.nonzero()[:, 0]
+                chosen = chosen & ~torch.from_numpy(left_out[index].reshape(-1))
+            kept = chosen.nonzero()[:, 0]
             pixels.append(kept.int())
             owners.append(torch.full_like(kept, index, dtype=torch.int16))
             # Eight bits hold what pictures hold; a pool of float32 would be four times as large.
@@ -290,8 +290,8 @@ class RayPool:
         view, pixel = self.owners[rows].long(), self.pixels[rows].long()
         fx, fy, cx, cy = self.lens[view].unbind(dim=1)
         x, y = pixel % self.widths[view], pixel // self.widths[view]
-        seen = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
-        directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], seen), dim=1)
+        local = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
+        directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], local), dim=1)
         mask = torch.ones(len(rows), device=self.device) if self.masks is None else self.masks[rows] / 255
         return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows)
 

@@ -109,22 +109,22 @@ class SceneObjective(Objective):
         started = sum(start <= done for start in self.config.starts)
         return min(started, self.model.geometry.num_levels) - 1
 
-    def look(self, step: int, done: float) -> None:
+    def refresh_grid(self, step: int, done: float) -> None:
         """Bring the SDF grid up to date: near the surface often, all of it now and then; see `Schedule`."""
         if self.grid is None:
             return
         plan = self.schedule
         self.grid.kept = self.kept["march"]  # that of a run which is resumed
-        looked, pause, looks = self.kept["looks"].tolist()
-        if step >= looked + pause or not looks:
+        last, pause, count = self.kept["looks"].tolist()
+        if step >= last + pause or not count:
             unsure = float(self.kept["lately"][1])
             cell = 2 * math.sqrt(3) / self.grid.resolution  # its diagonal: all corners beside the surface are that near
             self.grid.reach = min(max(plan.known * unsure, cell), max(plan.furthest, cell))
-            whole = looks % (plan.whole_every if done < plan.early else plan.whole_late) == 0
+            whole = count % (plan.whole_every if done < plan.early else plan.whole_late) == 0
             self.grid.refresh(self.model.geometry, whole=whole)
-            self.kept |= {"moved": self.grid.moved, "looks": torch.tensor([step, pause, looks + 1])}
+            self.kept |= {"moved": self.grid.moved, "looks": torch.tensor([step, pause, count + 1])}
 
-    def remember(self, step: int, samples: Tensor) -> None:
+    def read_back(self, step: int, samples: Tensor) -> None:
         """Fetch what the next steps depend on, all at once: a GPU is waited for."""
         unsure = 1 / self.model.inv_std.detach()
         known = [samples, unsure.to(samples)]
@@ -133,12 +133,12 @@ class SceneObjective(Objective):
             return
         *lately, moved = torch.stack([*known, self.kept["moved"].to(samples)]).tolist()
         self.kept["lately"] = torch.tensor(lately)
-        looked, pause, looks = self.kept["looks"].tolist()
+        last, pause, count = self.kept["looks"].tolist()
         plan = self.schedule
-        if looked > step - plan.near_every:  # since this was done last
+        if last > step - plan.near_every:  # since this was done last
             allowed = plan.moved * lately[1]
             pause = pause // 2 if moved > allowed else 2 * pause if moved < allowed / 2 else pause
-            self.kept["looks"] = torch.tensor([looked, min(max(pause, plan.near_every), plan.near_rest), looks])
+            self.kept["looks"] = torch.tensor([last, min(max(pause, plan.near_every), plan.near_rest), count])
 
     def batch(self) -> int:
         """Rays of the next step: fewer while their samples are many, as they are while the surface is uncertain."""
@@ -150,16 +150,16 @@ class SceneObjective(Objective):
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
-        kind = self.ahead(step, done)
+        kind = self.before_step(step, done)
         outcome = self.evaluate(kind)
-        self.behind(step, outcome.samples)
+        self.after_step(step, outcome.samples)
         return outcome.terms, outcome.total
 
-    def ahead(self, step: int, done: float) -> Kind:
+    def before_step(self, step: int, done: float) -> Kind:
         """Do what a step needs of the host first → the kind of the step."""
         self.done = done
         self.focus.watched(step, self.kept)
-        self.look(step, done)
+        self.refresh_grid(step, done)
         measured = self.measured
         if measured is not None:
             measured.affine = self.kept["affine"]  # that of a run which is resumed
@@ -173,10 +173,10 @@ class SceneObjective(Objective):
             measured=measured is not None and (done < self.schedule.faded or measured.is_exact),
         )
 
-    def behind(self, step: int, samples: Tensor) -> None:
+    def after_step(self, step: int, samples: Tensor) -> None:
         """Do what follows a step on the host; ``samples`` is the number evaluated per ray, 0-d."""
         if (step + 1) % self.schedule.near_every == 0:
-            self.remember(step, samples)
+            self.read_back(step, samples)
 
     def by_time(self, number: Callable[[float], float]) -> Tensor | float:
         """A number that depends on the share of the schedule that is done; a tensor in a CUDA graph."""
@@ -191,32 +191,32 @@ class SceneObjective(Objective):
         origins, directions = rays.origins, rays.directions
         if self.model.poses is not None:
             origins, directions = self.model.poses.moved(origins, directions, rays.view)
-        seen = self.model.render(
+        rendered = self.model.render(
             origins,
             directions,
             self.sampling,
             cos_anneal=self.by_time(lambda done: done / config.anneal) if kind.annealing else 1.0,
             level=kind.level,
-            least_weight=config.least_weight,
-            skip=config.skip,
+            early_stop_eps=config.least_weight,
+            alpha_threshold=config.skip,
             skip_share=config.skip_share,
-            guide=self.grid,
+            sdf_grid=self.grid,
             generator=self.generator,
         )
-        samples = (seen.counts > 0).sum() / len(origins)
+        samples = (rendered.counts > 0).sum() / len(origins)
         target = rays.color
         if pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
-        wrong = (self.model.photographed(seen, rays.view) - target).abs().mean(dim=1)
+        wrong = (self.model.photographed(rendered, rays.view) - target).abs().mean(dim=1)
         self.focus.learn(rays.row, wrong.detach())
         color = wrong.mean()
         # A mean over all intervals within the region, skipped ones included: some kept ones count for them.
-        within = (seen.counts > 0).any(dim=1).sum().to(wrong).clamp(min=1) * seen.counts.shape[1]
-        eikonal = (seen.counts * eikonal_loss(seen.jet.gradient)).sum() / within
+        within = (rendered.counts > 0).any(dim=1).sum().to(wrong).clamp(min=1) * rendered.counts.shape[1]
+        eikonal = (rendered.counts * eikonal_loss(rendered.jet.gradient)).sum() / within
         terms = {"color": color, "eikonal": eikonal}
         total = color + config.eikonal_weight * eikonal
         if pool.has_masks and config.mask_weight:
-            opacity = seen.opacity.clamp(1e-3, 1 - 1e-3)
+            opacity = rendered.opacity.clamp(1e-3, 1 - 1e-3)
             mask = torch.nn.functional.binary_cross_entropy(opacity, rays.mask)
             terms["mask"] = mask
             total = total + config.mask_weight * mask
@@ -298,7 +298,7 @@ class GraphTrainer(Trainer[SceneObjective]):
         return {"recorded": self.graphs.recorded, "not_taken": self.not_taken, **refused}
 
     def _step(self) -> dict[str, Tensor]:
-        kind = self.objective.ahead(self.step, self.fraction)
+        kind = self.objective.before_step(self.step, self.fraction)
         part = math.ceil(self.objective.config.rays / self.capacity.ray_counts)
         kind = kind._replace(rays=math.ceil(kind.rays / part) * part)
         capacities = self._capacities(kind)
@@ -306,7 +306,7 @@ class GraphTrainer(Trainer[SceneObjective]):
         # A replay changes parameters behind PyTorch's back; the fused kernels pack them again by their versions.
         torch.autograd.graph.increment_version(self.trained)
         samples = terms.pop("samples")
-        self.objective.behind(self.step, samples)
+        self.objective.after_step(self.step, samples)
         self.step += 1
         if self.step % self.objective.schedule.near_every == 0:
             self._read_requested(kind)

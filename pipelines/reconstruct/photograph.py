@@ -25,17 +25,17 @@ from .views import render_camera
 
 
 class TrainedScene(NamedTuple):
-    """What a reconstruction has left to be rendered, in unit-sphere coordinates."""
+    """A reconstruction that can be rendered, in unit-sphere coordinates."""
 
     model: SceneModel
     similarity: Similarity  # the way back to world coordinates
     sampling: Sampling  # where its rays are sampled
-    guide: ValueGrid | None  # SDF grid by which they are, or None
+    sdf_grid: ValueGrid | None  # places the samples; None for the coarsest level
 
     def paint(self, camera: Camera, level: int = -1) -> Image:
-        """What a camera, in unit-sphere coordinates, sees; as photographs of the usual exposure show it."""
-        seen = render_camera(self.model, camera, self.sampling, level=level, guide=self.guide)
-        return (255 * seen.color).round().astype(np.uint8)
+        """The image of a camera in unit-sphere coordinates, with the mean exposure of the photographs."""
+        image = render_camera(self.model, camera, self.sampling, level=level, sdf_grid=self.sdf_grid)
+        return (255 * image.color).round().astype(np.uint8)
 
 
 def open_scene(run: str | Path, *, device: torch.device | str = "cpu") -> TrainedScene:
@@ -58,10 +58,10 @@ def open_scene(run: str | Path, *, device: torch.device | str = "cpu") -> Traine
         cells = int(about["march_grid"])
         if cells > 1024:
             raise ValueError(f"a grid of {cells}³ cells")
-    guide = ValueGrid(cells, geometry.like.device) if cells else None
-    if guide is not None:
-        guide.refresh(geometry)
-    return TrainedScene(SceneModel.of(geometry, radiance), similarity, sampling, guide)
+    sdf_grid = ValueGrid(cells, geometry.like.device) if cells else None
+    if sdf_grid is not None:
+        sdf_grid.refresh(geometry)
+    return TrainedScene(SceneModel.of(geometry, radiance), similarity, sampling, sdf_grid)
 
 
 def photograph(

@@ -172,10 +172,10 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
             )
         self.trainer = scene_trainer(self.model, pool, config, measured=self.measured)
         # Of the training pixels, their masks, the cameras and what was measured.
-        seen = [pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks])]
+        inputs = [pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks])]
         if self.measured is not None:
-            seen += [self.measured.along, self.measured.numbers]
-        self.fingerprint = digest_of(tensor.cpu().numpy() for tensor in seen)
+            inputs += [self.measured.along, self.measured.numbers]
+        self.fingerprint = digest_of(tensor.cpu().numpy() for tensor in inputs)
         self.shown = 0
         self.reserved = 0.0  # seconds of the time budget for the surface, which comes after the training
 
@@ -283,7 +283,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         """A view as the levels up to ``level`` show it; None: those that are switched on by now."""
         objective, level = self.trainer.objective, self.level if level is None else level
         image = render_image(
-            self.model, view, self.images.similarity, objective.sampling, level=level, guide=objective.grid
+            self.model, view, self.images.similarity, objective.sampling, level=level, sdf_grid=objective.grid
         )
         # The exposure of a view that is not trained on is unknown.
         return image if self.model.exposures is None else exposed_as(image, view, self.model.background)
@@ -396,14 +396,14 @@ def surface_colors(model: SceneModel, points: Tensor, eyes: Tensor) -> Tensor:
         # The first of the cameras that face a point: they count the more, the earlier they come.
         count = min(FINISH.most_views, len(eyes))
         rank = torch.arange(len(eyes), 0, -1, device=part.device) * facing
-        found, chosen = rank.topk(count, dim=1)
+        ranks, chosen = rank.topk(count, dim=1)
         directions = along.gather(1, chosen[:, :, None].expand(-1, -1, 3))
-        row, witness = (found > 0).nonzero(as_tuple=True)
-        seen = part.new_full((len(part), count, 3), torch.nan)
-        seen[row, witness] = model.color(part[row], directions[row, witness], Jet(*(held[row] for held in jet)))
+        row, view = (ranks > 0).nonzero(as_tuple=True)
+        colors = part.new_full((len(part), count, 3), torch.nan)
+        colors[row, view] = model.color(part[row], directions[row, view], Jet(*(held[row] for held in jet)))
         ahead = model.color(part, -normal, jet)
-        enough = (found > 0).sum(dim=1, keepdim=True) >= FINISH.least_views
-        parts.append(torch.where(enough, seen.nanquantile(FINISH.darker, dim=1), ahead))
+        enough = (ranks > 0).sum(dim=1, keepdim=True) >= FINISH.least_views
+        parts.append(torch.where(enough, colors.nanquantile(FINISH.darker, dim=1), ahead))
     return torch.cat(parts)
 
 

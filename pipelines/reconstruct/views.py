@@ -49,15 +49,15 @@ def render_camera(
     sampling: Sampling,
     *,
     level: int = -1,
-    least_weight: float = 1e-4,
-    skip: float = 1e-4,
-    guide: Callable[[Tensor], Tensor] | None = None,
+    early_stop_eps: float = 1e-4,
+    alpha_threshold: float = 1e-4,
+    sdf_grid: Callable[[Tensor], Tensor] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ViewImage:
-    """What a camera in unit-sphere coordinates sees by volume rendering, a ray through the middle of each pixel.
+    """Volume-render the image of a camera in unit-sphere coordinates, a ray through the middle of each pixel.
 
-    ``least_weight``, ``skip`` and ``guide`` are those of `SceneModel.render`; ``progress`` is told (rays done, rays in
-    all).
+    ``early_stop_eps``, ``alpha_threshold`` and ``sdf_grid`` are those of `SceneModel.render`. ``progress`` is called
+    with (rays done, rays in all).
     """
     device = model.background.device
     origins, directions = (part.to(device) for part in camera_rays(camera))
@@ -65,16 +65,17 @@ def render_camera(
     normal, opacity = torch.zeros_like(color), torch.zeros_like(color[:, 0])
     near, far = sphere_span(origins, directions)
     # Rays that pass the region of interest see the background, whose colour is known unless it is learnt.
-    asked = (far > near).nonzero()[:, 0] if model.outside is None else torch.arange(len(origins), device=device)
+    cast = (far > near).nonzero()[:, 0] if model.outside is None else torch.arange(len(origins), device=device)
     done = 0
-    for rows in asked.split(4096):
-        seen = model.render(
-            origins[rows], directions[rows], sampling, level=level, least_weight=least_weight, skip=skip, guide=guide
-        )
-        color[rows], normal[rows], opacity[rows] = seen.color, seen.normal, seen.opacity
+    for rows in cast.split(4096):
+        rendered = model.render(
+            origins[rows], directions[rows], sampling, level=level,
+            early_stop_eps=early_stop_eps, alpha_threshold=alpha_threshold, sdf_grid=sdf_grid,
+        )  # fmt: skip
+        color[rows], normal[rows], opacity[rows] = rendered.color, rendered.normal, rendered.opacity
         done += len(rows)
         if progress:
-            progress(done, len(asked))
+            progress(done, len(cast))
     shape = (camera.height, camera.width)
     return ViewImage(
         color.clamp(0, 1).reshape(*shape, 3).cpu().numpy(),
@@ -174,7 +175,7 @@ SeenFrom = tuple[Camera, NDArray[np.float32] | None]
 
 @torch.no_grad()
 def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]:
-    """Points ``(N, 3)`` of the surface that two photographs see at least, on the CPU, and the distance of neighbours.
+    """Points ``(N, 3)`` of the surface with a view count of at least two, on the CPU, and the distance of neighbours.
 
     Every view is traced in up to 10,000 pixels of what its mask calls object, and all together in 300,000. Places are
     told apart that are 1/32 of a radius apart, or as far as neighbouring pixels on a surface that is seen obliquely.
@@ -187,15 +188,14 @@ def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]
     for number, (whole, mask) in enumerate(views):
         camera = _coarse(whole, pixels)
         eye, directions = camera.rays(device=field.like.device)
-        asked = torch.ones(directions.shape[:2], dtype=torch.bool)
+        traced = torch.ones(directions.shape[:2], dtype=torch.bool)
         if mask is not None:
-            asked = torch.from_numpy(shrink(mask, camera.width, camera.height) > OBJECT)
-        rays = directions[asked.to(directions.device)].to(field.like)
+            traced = torch.from_numpy(shrink(mask, camera.width, camera.height) > OBJECT)
+        rays = directions[traced.to(directions.device)].to(field.like)
         eyes = eye.to(rays).expand_as(rays)
         hits = sphere_trace(field, eyes, rays, tolerance=1e-3, resolution=1e-3, radius=1.0)
-        found = hits.position[hits.mask].cpu().double()
-        points.append(found)
-        owners.append(torch.full((len(found),), number))
+        points.append(hits.position[hits.mask].cpu().double())
+        owners.append(torch.full((len(points[-1]),), number))
         pitches.append(hits.depth[hits.mask].cpu().double() / float(camera.intrinsics[0, 0]))
     every = torch.cat(points)
     if not len(every):
@@ -206,9 +206,9 @@ def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]
     place = (cells[:, 0] * across + cells[:, 1]) * across + cells[:, 2]
     # A view counts once in a place, however many of its pixels see it.
     pairs = torch.unique(place * len(views) + torch.cat(owners))
-    known, count = torch.unique(pairs // len(views), return_counts=True)
-    # What one view alone sees, it cannot measure.
-    return every[torch.isin(place, known[count >= min(2, len(views))])], within
+    cell, view_count = torch.unique(pairs // len(views), return_counts=True)
+    # One view alone does not determine a depth.
+    return every[torch.isin(place, cell[view_count >= min(2, len(views))])], within
 
 
 def _coarse(camera: Camera, pixels: int) -> Camera:

@@ -164,7 +164,7 @@ class TestBands:
         assert base.jets == seen.depths.numel()
 
     def test_samples_cover_the_band_where_the_finer_surface_may_lie(self) -> None:
-        # Were the guide as sharp as it gets, all samples would sit on the coarse surface.
+        # Were the weights that place samples as sharp as they get, all samples would sit on the coarse surface.
         origins, directions = rays(50)
         near, far = sphere_span(origins, directions)
         edges = sample_depths(self.field(), origins, directions, near, far, Sampling(importance=64, sharpness=1e4))
@@ -305,16 +305,16 @@ class TestSkipping:
         assert (seen.counts == 1).sum(dim=1).tolist() == [1, 1]
         assert bool((seen.depths[seen.counts == 1] - 2.0).abs().max() < 0.05)
 
-    def test_a_guide_saves_the_march_its_network(self) -> None:
+    def test_an_sdf_grid_places_samples_without_the_network(self) -> None:
         field = self.field().float()
         wrapped, (base, residual) = counted(field)
         origins, directions = rays(100)
         grid = ValueGrid(48)
         grid.refresh(field)
         options = {"inv_std": 150.0, "alpha_threshold": 1e-4, "sdf_grid": grid}
-        guided = render_volume(wrapped, position_color, origins, directions, **options)
+        by_grid = render_volume(wrapped, position_color, origins, directions, **options)
         assert base.values == residual.values == 0
-        assert base.jets == int((guided.counts > 0).sum())
+        assert base.jets == int((by_grid.counts > 0).sum())
         full = render_volume(field, position_color, origins, directions, inv_std=150.0)
         # Both place samples of their own around the same surface: 1/s is what they may differ by in depth.
-        assert float((guided.color - full.color).abs().max()) < 1 / 150
+        assert float((by_grid.color - full.color).abs().max()) < 1 / 150

@@ -131,12 +131,12 @@ def test_a_step_that_exceeds_its_capacity_is_not_taken_and_the_capacity_grows(im
     trainer = replaying(images, "masks", torch.device("cpu"))
     for _ in range(16):
         trainer._step()
-    kind = trainer.objective.ahead(trainer.step, trainer.fraction)._replace(rays=32)
+    kind = trainer.objective.before_step(trainer.step, trainer.fraction)._replace(rays=32)
     trainer.capacities = {kind: (1, 1, 1, 1)}
     trainer.requested = {}  # so that they are not found too small
     before = weights(trainer)
     moments = {name: tensor.clone() for name, tensor in trainer.state().items() if name.startswith("adam.")}
-    trainer.objective.ahead = lambda step, done: kind  # pyright: ignore[reportAttributeAccessIssue]
+    trainer.objective.before_step = lambda step, done: kind  # pyright: ignore[reportAttributeAccessIssue]
     trainer._step()
     for name, tensor in weights(trainer).items():
         assert name == "geometry.deltas" or torch.equal(tensor, before[name]), name
@@ -167,7 +167,7 @@ def test_a_resumed_run_records_again_and_goes_on(images: PosedImages) -> None:
 
 def test_capacities_follow_the_requested_rows_and_stay_while_they_suit(images: PosedImages) -> None:
     trainer = replaying(images, "masks", torch.device("cpu"))
-    kind = trainer.objective.ahead(0, 0.0)._replace(rays=100)
+    kind = trainer.objective.before_step(0, 0.0)._replace(rays=100)
     assert trainer._capacities(kind) is None  # before anything is known all rows have a place
     # 1.25 times as many and 64, in whole 256s; changed where more than 95 % are requested, or less than half would do.
     for requested, capacity in ((10.0, 1536), (14.0, 1536), (15.0, 2048), (6.0, 2048), (5.0, 768)):

@@ -228,9 +228,9 @@ def test_the_grid_is_left_alone_while_the_surface_rests(images: PosedImages) -> 
     looked = []
 
     def take(step: int) -> None:
-        objective.look(step, step / 1000)
+        objective.refresh_grid(step, step / 1000)
         if (step + 1) % 16 == 0:
-            objective.remember(step, torch.tensor(3.0))
+            objective.read_back(step, torch.tensor(3.0))
 
     for step in range(600):
         before = int(objective.kept["looks"][0])
@@ -245,7 +245,7 @@ def test_the_grid_is_left_alone_while_the_surface_rests(images: PosedImages) -> 
     assert objective.kept["looks"][1] == 16
     again = make(images, TINY)
     again.objective.kept = dict(objective.kept)
-    again.objective.look(768, 0.768)
+    again.objective.refresh_grid(768, 0.768)
     assert torch.equal(again.objective.grid.kept, objective.grid.kept)
 
 

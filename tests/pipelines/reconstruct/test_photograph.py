@@ -37,7 +37,7 @@ def run(images: PosedImages, tmp_path_factory: pytest.TempPathFactory) -> Recons
 def test_a_held_out_view_is_seen_as_it_was_measured(run: Reconstruction, images: PosedImages, tmp_path: Path) -> None:
     grid = ValueGrid(8)
     grid.refresh(run.model.geometry)
-    seen = render_image(run.model, images.views[0], Similarity.identity(), Sampling(8, 4), guide=grid).color
+    seen = render_image(run.model, images.views[0], Similarity.identity(), Sampling(8, 4), sdf_grid=grid).color
     scene = open_scene(run.directory)
     assert scene.model.outside is not None
     # s goes through a logarithm and back: a few roundings, which its exponential makes ten times as many.

@@ -131,7 +131,7 @@ def test_cameras_astray_are_brought_back(images: PosedImages) -> None:
     wrong[1, 2], wrong[2, 2] = math.radians(2.0), -math.radians(2.0)
     views = []
     for view, turn in zip(images.views, wrong, strict=True):
-        seen = render_image(model, view, Similarity.identity(), Sampling(32, 16), skip=0.0)
+        seen = render_image(model, view, Similarity.identity(), Sampling(32, 16), alpha_threshold=0.0)
         pose, camera = view.camera.world_from_camera.clone(), view.camera
         spin = torch.linalg.matrix_exp(turn[2] * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
         pose[:3, :3] = spin.to(pose) @ pose[:3, :3]

@@ -138,12 +138,12 @@ def test_a_grid_of_values_finds_the_same_picture() -> None:
     model, grid = exact_model(60.0), ValueGrid(64)
     (view,) = painted_sphere(1, 12, 3).views
     grid.refresh(model.geometry)
-    exact, guided = (
-        posed.render_image(model, view, Similarity.identity(), Sampling(32, 32), guide=guide).color
-        for guide in (None, grid)
+    exact, by_grid = (
+        posed.render_image(model, view, Similarity.identity(), Sampling(32, 32), sdf_grid=sdf_grid).color
+        for sdf_grid in (None, grid)
     )
     # Values of the grid are off by 3/8 K h² = 0.0015, a tenth of 1/s: samples lie elsewhere, sums hardly change.
-    np.testing.assert_allclose(guided, exact, rtol=0, atol=0.02)
+    np.testing.assert_allclose(by_grid, exact, rtol=0, atol=0.02)
 
 
 def test_a_sheet_shows_photograph_rendering_and_normals() -> None:
