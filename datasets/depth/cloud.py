@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
+from ...neural_fields.backend.errors import renamed
 from ..clouds.point_cloud import PointCloud, colors_from, select, spread, thin
 from ..clouds.readers.reading import MIN_POINTS
 from .cleaning import edge_pixels, grid_normals, measure_noise, smooth_depth, specks
@@ -30,7 +31,7 @@ class FusionOptions:
     typical: float = 0.99  # share of the points nearer than the typical depth
     stray: float = 1.5  # furthest over typical depth from which the report suggests --max-depth
     tolerance: float = 0.03  # of the depth, by which a point is in front of a frame's surface, or on it
-    witnesses: int = 12  # frames that each point is projected into, for linear time
+    visibility_frames: int = 12  # frames that each point is projected into, for linear time
     room: int = 2  # points that are kept for the vote, over those that stay
 
 
@@ -174,12 +175,13 @@ def frame_cloud(frame: RgbdFrame, settings: DepthSettings | None = None) -> tupl
     return cloud, report
 
 
+@partial(renamed, witnesses="visibility_frames")
 def fuse_frames(
     frames: Iterable[RgbdFrame],
     settings: DepthSettings | None = None,
     *,
     tolerance: float = FUSION.tolerance,
-    witnesses: int = FUSION.witnesses,
+    visibility_frames: int = FUSION.visibility_frames,
 ) -> tuple[PointCloud, DepthReport]:
     """Join one or more depth maps in world coordinates → a cloud and a report.
 
@@ -191,15 +193,17 @@ def fuse_frames(
             iterable that reads its frames needs memory for one.
         settings: of the cleaning; ``max_points`` is for all frames together.
         tolerance: relative difference of depths up to which a frame sees the same point.
-        witnesses: number of other frames, evenly spread over the sequence, that vote on a frame's points.
+        visibility_frames: number of other frames, spread evenly, in which the visibility of a point is tested.
 
     Raises:
         InputError: there are no frames, nothing is left, or only some frames have colours.
-        ValueError: ``tolerance`` is not between 0 and 1, ``witnesses`` is negative, or ``frames`` is an iterator.
+        ValueError: ``tolerance`` is not in (0, 1), ``visibility_frames`` is negative, or ``frames`` is an iterator.
     """
     settings = settings or DepthSettings()
-    if not 0 < tolerance < 1 or witnesses < 0:
-        raise ValueError(f"tolerance={tolerance}, witnesses={witnesses}: expected one in (0, 1) and one >= 0")
+    if not 0 < tolerance < 1 or visibility_frames < 0:
+        raise ValueError(
+            f"tolerance={tolerance}, visibility_frames={visibility_frames}: expected one in (0, 1) and one >= 0"
+        )
     if isinstance(frames, Iterator):
         raise ValueError("frames: an iterator, which ends after one pass; expected a list, or what begins anew")
     pool = _Pool(settings)
@@ -208,10 +212,10 @@ def fuse_frames(
     if not reports:
         raise InputError("frames: none given; name at least one depth map")
     (cloud, owner), seen_through = pool.joined(), 0
-    if len(reports) > 1 and witnesses:
-        asked = _witnesses(len(reports), witnesses)
-        ask = partial(_votes, cloud.points, owner, asked, tolerance)
-        through = sum(map(ask, count(), frames), np.zeros(len(cloud), np.int64))
+    if len(reports) > 1 and visibility_frames:
+        others = _other_frames(len(reports), visibility_frames)
+        votes = partial(_votes, cloud.points, owner, others, tolerance)
+        through = sum(map(votes, count(), frames), np.zeros(len(cloud), np.int64))
         seen_through = int((through > 0).sum())
         cloud = select(cloud, through <= 0)
     cloud = thin(cloud, settings.max_points)
@@ -253,15 +257,15 @@ class _Pool:
         return _concatenated(self.clouds), np.concatenate(self.owners)
 
 
-def _witnesses(frames: int, limit: int) -> Int64:
+def _other_frames(frames: int, limit: int) -> Int64:
     """At most ``limit`` of the other frames, evenly spread, for each frame ``(frames, K)``."""
     others = np.linspace(0, frames - 2, min(limit, frames - 1)).round().astype(np.int64)
     return others + (others >= np.arange(frames)[:, None])
 
 
-def _votes(points: Float64, owner: Int32, asked: Int64, tolerance: float, index: int, frame: RgbdFrame) -> Int64:
-    """Votes of a frame on the points ``(N, 3)`` of the frames that it is a witness of, see `_verdict`; else 0."""
-    mine = np.flatnonzero((asked == index).any(axis=1)[owner])
+def _votes(points: Float64, owner: Int32, others: Int64, tolerance: float, index: int, frame: RgbdFrame) -> Int64:
+    """Votes of a frame, see `_verdict`, on the points ``(N, 3)`` of frames with it among their ``others``; else 0."""
+    mine = np.flatnonzero((others == index).any(axis=1)[owner])
     votes = np.zeros(len(points), np.int64)
     votes[mine] = _verdict(points[mine], frame, _nearest_around(frame.depth), tolerance)
     return votes

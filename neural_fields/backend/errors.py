@@ -1,6 +1,13 @@
-"""The error type of bad input, and checks of numbers."""
+"""The error type of bad input, checks of numbers, and earlier names of arguments."""
 
 from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar, cast
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 class InputError(ValueError):
@@ -23,3 +30,16 @@ def positive(**numbers: float) -> None:
     for name, number in numbers.items():
         if not number > 0:
             raise ValueError(f"{name}={number}: expected > 0")
+
+
+def renamed(function: F, **names: str) -> F:
+    """The function, which accepts arguments by their ``names`` of earlier releases too, with a warning."""
+
+    @wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        for old in names.keys() & options.keys():
+            warnings.warn(f"{old} is now called {names[old]}", DeprecationWarning, stacklevel=2)
+            options[names[old]] = options.pop(old)
+        return function(*arguments, **options)
+
+    return cast("F", call)

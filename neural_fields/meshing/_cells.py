@@ -254,10 +254,10 @@ def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints
     blocks = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     while True:
         reach = lipschitz * lattice.step * size * math.sqrt(3) / 2
-        asked = next((j for j, delta in enumerate(deltas) if 4 * delta <= reach), level) if size > 2 else level
-        slack = deltas[asked] if asked < level else 0.0
+        used = next((j for j, delta in enumerate(deltas) if 4 * delta <= reach), level) if size > 2 else level
+        slack = deltas[used] if used < level else 0.0
         stage = f"blocks of {size}³ cells"
-        values = sampler.values(len(blocks), lambda part: blocks[part] + size // 2, level=asked, stage=stage)  # noqa: B023
+        values = sampler.values(len(blocks), lambda part: blocks[part] + size // 2, level=used, stage=stage)  # noqa: B023
         kept = (np.abs(values) <= reach + slack) | _beside_other_sign(blocks // size, values < 0)
         if not kept.any():
             raise NoSurfaceError(_where_signs_are(values, blocks + size // 2, lattice, sampler))
@@ -350,10 +350,10 @@ class _Corners:
         # Two spare layers on each axis let the key of any neighbour be had by adding a stride.
         self.size = tuple(cells // 2 + 3 for cells in self.lattice.shape)
         self.strides = np.array([self.size[1] * self.size[2], self.size[2], 1])
-        seen = (blocks // 2 + 1) @ self.strides
+        all_keys = (blocks // 2 + 1) @ self.strides
         order = np.flatnonzero(kept)
-        order = order[np.argsort(seen[order])]
-        self.blocks, self.keys = blocks[order], seen[order]
+        order = order[np.argsort(all_keys[order])]
+        self.blocks, self.keys = blocks[order], all_keys[order]
         self.owners = self.keys
         for stride in self.strides:
             self.owners = _merged(self.owners, self.owners + stride)
@@ -367,7 +367,7 @@ class _Corners:
         owner = np.searchsorted(self.owners, known[0] // 8)
         self._set(owner * 8 + known[0] % 8, known[1])
         self.inside = np.zeros(count, bool)
-        self._find_signs(seen, centres, lipschitz * self.lattice.step)
+        self._find_signs(all_keys, centres, lipschitz * self.lattice.step)
         self._verify_ends()
 
     def rows(self, offset: Ints) -> NDArray[np.int32]:
@@ -396,14 +396,14 @@ class _Corners:
         values = self.sampler.values(len(rows), lambda part: self.points(rows[part]), level=self.level, stage=stage)
         self._set(rows, values)
 
-    def _find_signs(self, seen: Ints, centres: Floats, slope: float) -> None:
+    def _find_signs(self, all_keys: Ints, centres: Floats, slope: float) -> None:
         """Bound the field at every point by ``centres ± slope · distance``, and evaluate where that leaves both signs.
 
-        ``seen`` are the keys of all blocks whose centre is known, inside the set or not.
+        ``all_keys`` are the keys of all blocks whose centre was evaluated, in the set or not.
         """
         low, high = np.full_like(self.value, -np.inf), np.full_like(self.value, np.inf)
         for corner in CORNERS:
-            keys = seen + corner @ self.strides
+            keys = all_keys + corner @ self.strides
             owner = np.minimum(np.searchsorted(self.owners, keys), len(self.owners) - 1).astype(np.int32)
             listed = self.owners[owner] == keys
             owner, values = owner[listed], centres[listed]

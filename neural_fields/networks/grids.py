@@ -39,8 +39,8 @@ def check_table(table_size: int, coarsest: int, finest: int) -> None:
         raise ValueError(f"coarsest={coarsest}, finest={finest}: expected 1 ≤ coarsest ≤ finest")
 
 
-def tables_apart(*modules: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
-    """The tables of hash encodings among the parameters of modules, and all others, which want another rate."""
+def split_tables(*modules: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    """The tables of hash encodings among the parameters of modules, and all others, for another learning rate."""
     tables = [part.table for module in modules for part in module.modules() if isinstance(part, HashEncoding)]
     known = {id(table) for table in tables}
     return tables, [p for module in modules for p in module.parameters() if id(p) not in known]
@@ -97,9 +97,9 @@ class HashEncoding(nn.Module):
         In the precision of the table, under ``autocast`` too: half precision cannot place a position in a fine cell.
         """
         with torch.autocast(x.device.type, enabled=False):
-            return self._looked_up(x.to(self.table.dtype))
+            return self._lookup(x.to(self.table.dtype))
 
-    def _looked_up(self, x: Tensor) -> Tensor:
+    def _lookup(self, x: Tensor) -> Tensor:
         rows = x.reshape(-1, 1, 3)
         cells = self.cells[:, None]
         at = (rows.clamp(-self.extent, self.extent) + self.extent) * (0.5 / self.extent) * cells  # (N, L, 3)
@@ -176,10 +176,10 @@ class ValueGrid:
         if whole:
             squared = axis.square()
             length = (squared[:, None, None] + squared[:, None] + squared).sqrt()
-            asked = length <= 1 + 3**0.5 * edge
+            chosen = length <= 1 + 3**0.5 * edge
         else:
-            asked = near
-        cells = asked.nonzero()
+            chosen = near
+        cells = chosen.nonzero()
         flat = self.kept.view(-1)
         squares = flat.new_zeros(())
         for part in cells.split(1 << 15):

@@ -6,18 +6,17 @@ are evaluated only in their bands, and colours only for samples that contribute 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial, wraps
-from typing import Any, NamedTuple, TypeVar, cast
+from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..backend.devices import precise, uniform
-from ..backend.errors import at_least, positive
+from ..backend.errors import at_least, positive, renamed
 from ..backend.fixed_shapes import chosen
 from ..fields.field import Field, FieldLike, Jet, as_field
 from .weights import (
@@ -37,8 +36,6 @@ RayColor = Callable[[Tensor, Tensor, Jet], Tensor]
 """Colours ``(N, 3)`` of points ``(N, 3)`` seen along unit directions ``(N, 3)``, given the geometry's jet there."""
 RayOutside = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Density ``(N,)`` ≥ 0 and colour ``(N, 3)`` outside the unit sphere, at `invert_outside` points ``(N, 4)``."""
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
@@ -111,20 +108,7 @@ class Rendered(NamedTuple):
     counts: Tensor
 
 
-def _renamed(function: F, **names: str) -> F:
-    """The function, which accepts arguments by their ``names`` of earlier releases too, with a warning."""
-
-    @wraps(function)
-    def call(*arguments: Any, **options: Any) -> Any:
-        for old in names.keys() & options.keys():
-            warnings.warn(f"{old} is now called {names[old]}", DeprecationWarning, stacklevel=2)
-            options[names[old]] = options.pop(old)
-        return function(*arguments, **options)
-
-    return cast("F", call)
-
-
-@partial(_renamed, least_weight="early_stop_eps", skip="alpha_threshold", guide="sdf_grid")
+@partial(renamed, least_weight="early_stop_eps", skip="alpha_threshold", guide="sdf_grid")
 def render_volume(
     field: FieldLike,
     color: RayColor,
@@ -177,8 +161,8 @@ def render_volume(
         >>> from mplicits.neural_fields import Sphere, render_volume
         >>> red = lambda x, direction, jet: torch.tensor([1.0, 0.0, 0.0]).expand_as(x)
         >>> eye, ahead = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])
-        >>> seen = render_volume(Sphere(radius=0.5), red, eye, ahead, inv_std=1000.0)
-        >>> seen.color.round(decimals=3).tolist(), round(float(seen.depth), 2)
+        >>> rendered = render_volume(Sphere(radius=0.5), red, eye, ahead, inv_std=1000.0)
+        >>> rendered.color.round(decimals=3).tolist(), round(float(rendered.depth), 2)
         ([[1.0, 0.0, 0.0]], 1.5)
     """
     field, sampling = as_field(field), sampling or Sampling()
@@ -223,7 +207,7 @@ def sample_rays(
     edges = sample_depths(
         field, origins, directions, near, far, sampling, level=level, sdf_grid=sdf_grid, generator=generator
     )
-    # Intervals of a ray that misses the sphere have no length, and stand for nothing.
+    # Intervals of a ray that misses the sphere have no length, and do not count.
     counts = (far > near).to(edges)[:, None].expand(-1, edges.shape[1] - 1)
     skipped = alpha_threshold > 0 and counts.numel() > 0
     if skipped:
@@ -372,13 +356,13 @@ def _behind(
     generator: torch.Generator | None,
 ) -> Tensor:
     """The colour ``(R, 3)`` behind the unit sphere, from ``count`` samples."""
-    # A ray that misses the sphere begins to see the outside where it is nearest to the centre.
+    # For a ray that misses the sphere, the outside begins at the point nearest to the centre.
     nearest = torch.maximum(far, -(origins * directions).sum(dim=-1))
     depths = outside_depths(nearest, count, generator=generator)
     points = invert_outside(ray_points(origins, directions, depths))
     along = directions[:, None].expand(-1, count, -1).reshape(-1, 3)
-    density, seen = outside(points.flatten(0, 1), along)
+    density, colors = outside(points.flatten(0, 1), along)
     interval = torch.cat((depths.diff(dim=1), depths[:, -1:]), dim=1)
     weights, remaining = transmittance_weights(density.reshape(depths.shape) * interval)
-    mixed = composite(weights, seen.reshape(*depths.shape, 3))
+    mixed = composite(weights, colors.reshape(*depths.shape, 3))
     return mixed if background is None else mixed + remaining[:, None] * background

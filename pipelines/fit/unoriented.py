@@ -47,7 +47,7 @@ class SignOptions:
 SIGNING = SignOptions()
 
 STAGE = "level 0: signs"
-STAGES = tuple(f"{STAGE} ({number} of 2)" for number in (1, 2))  # one for each witness
+STAGES = tuple(f"{STAGE} ({number} of 2)" for number in (1, 2))  # one for each estimate of the outside
 
 
 class Signs(NamedTuple):
@@ -55,12 +55,12 @@ class Signs(NamedTuple):
 
     turned: NDArray[np.bool_]  # (N,) normals of the wrong sign
     slope: float  # mean of |⟨∇f, N⟩| at the points: about 1 for clear signs, near 0 for none
-    witness: str  # source of the outside that was used: "exterior" or "winding"
+    source: str  # estimate of the outside that was used: "exterior" or "winding"
 
     def record(self) -> dict[str, Any]:
         """For ``run.json``."""
         turned = int(self.turned.sum())
-        return {"turned_normals": turned, "slope": self.slope, "clear": self.clear, "witness": self.witness}
+        return {"turned_normals": turned, "slope": self.slope, "clear": self.clear, "witness": self.source}
 
     @property
     def clear(self) -> bool:
@@ -118,8 +118,8 @@ def give_signs(
     places = places or Places.around(CloudDistance(points, normals), seed=config.seed)
     outside = (places.region == OUTER_REGION).float()
     found: list[tuple[Tensor, str]] = []
-    witnesses = (("winding", places.winding, None), ("exterior", outside, places.region))
-    for stage, (witness, sign, region) in zip(STAGES, witnesses, strict=True):
+    estimates = (("winding", places.winding, None), ("exterior", outside, places.region))
+    for stage, (source, sign, region) in zip(STAGES, estimates, strict=True):
         siren = new_level(config, 0, residual=False).to(device)
         generator = torch.Generator().manual_seed(config.seed)
         objective = _Unoriented(
@@ -130,13 +130,13 @@ def give_signs(
             return None
         with torch.no_grad():
             gradient = torch.cat([siren.jet(part.to(device)).gradient.cpu() for part in points.split(1 << 16)])
-        found.append(((gradient * normals).sum(dim=1), witness))
-    slope, witness = max(found, key=lambda one: float(one[0].abs().mean()))
+        found.append(((gradient * normals).sum(dim=1), source))
+    slope, source = max(found, key=lambda one: float(one[0].abs().mean()))
     clear = float(slope.abs().mean())
     if clear < options.faint:
-        return Signs(np.zeros(len(points), bool), clear, witness)
+        return Signs(np.zeros(len(points), bool), clear, source)
     signs = settle_signs(points.double().numpy(), normals.double().numpy(), slope.double().numpy())
-    return Signs(signs < 0, clear, witness)
+    return Signs(signs < 0, clear, source)
 
 
 def fits_better(cloud: OrientedCloud, signs: Signs, options: SignOptions = SIGNING) -> bool:

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from ...neural_fields import ColorNetwork, MultiscaleSDF, NerfstudioField, Siren, fit_sphere
 from ...neural_fields.hosts.learning_rates import HOST_RATE
-from ...neural_fields.networks.grids import HashEncoding, tables_apart
+from ...neural_fields.networks.grids import HashEncoding, split_tables
 from ..training.settings import ReconstructConfig
 from .schedule import WarmCosine
 
@@ -121,7 +121,7 @@ class _Multiscale:
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Those of nerfstudio, its "fields" in parts which want rates of their own: see `RATES`."""
         groups: dict[str, list[nn.Parameter]] = super().get_param_groups()  # pyright: ignore[reportAttributeAccessIssue]
-        grid, groups["colors"] = tables_apart(self.field.color)
+        grid, groups["colors"] = split_tables(self.field.color)
         groups["fields"] = list(self.field.field.parameters())
         groups["deviation"] = list(self.field.deviation_network.parameters())
         return groups | ({"color_grid": grid} if grid else {})

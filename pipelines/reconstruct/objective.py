@@ -13,7 +13,7 @@ from torch import Tensor
 from ...neural_fields.backend.devices import graph_input, has_graph_inputs
 from ...neural_fields.backend.fixed_shapes import FixedShapes, fixed_shapes
 from ...neural_fields.fields.losses import eikonal_loss
-from ...neural_fields.networks.grids import ValueGrid, tables_apart
+from ...neural_fields.networks.grids import ValueGrid, split_tables
 from ...neural_fields.volume.render import Sampling
 from ..training.cuda_graphs import CudaGraphRecorder, GraphCache, Recorder
 from ..training.settings import ReconstructConfig
@@ -70,7 +70,7 @@ class SceneObjective(Objective):
     ) -> None:
         rate = warm_cosine(config.learning_rate)
         parts = [part for part in (model.color, model.outside, model.exposures) if part is not None]
-        grid, colors = tables_apart(*parts)
+        grid, colors = split_tables(*parts)
         groups = [
             Group(list(model.geometry.parameters()), rate),
             Group(colors, lambda done: config.color_rate * rate(done)),

@@ -44,33 +44,33 @@ def mode() -> str:
 def choose(x: Tensor, *, width: int, depth: int, features: int = 0, levels: int = 1) -> Choice:
     """How a SIREN, or several in one launch, is evaluated at points ``x`` without a graph.
 
-    ``width`` and ``depth`` are the largest of all; ``features`` is the number of outputs asked for beside the value.
+    ``width`` and ``depth`` are the largest of all; ``features`` is the number of outputs requested besides the value.
     """
-    asked = mode()
+    requested = mode()
     reason = ""
-    if asked == "off":
+    if requested == "off":
         reason = f"{VARIABLE}=off"
-    elif asked != "interpret" and x.device.type != "cuda":
+    elif requested != "interpret" and x.device.type != "cuda":
         reason = f"points on {x.device.type}; the kernels are for CUDA"
     elif x.dtype != torch.float32:
         reason = f"{x.dtype}; the kernels compute in float32"
     elif features:
-        reason = "features are asked for; the kernels have none"
+        reason = "features are requested; the kernels have none"
     elif width > MAX_WIDTH or depth > MAX_DEPTH:
         reason = f"({width}, {depth}) is more than width {MAX_WIDTH} or depth {MAX_DEPTH}"
     elif levels > MAX_LEVELS:
         reason = f"{levels} levels are more than {MAX_LEVELS}; they are evaluated one by one"
     else:
-        reason = obstacle(x.device, asked)
+        reason = obstacle(x.device, requested)
     return Choice(not reason, reason)
 
 
 @functools.cache
-def obstacle(device: torch.device, asked: str) -> str:
+def obstacle(device: torch.device, requested: str) -> str:
     """What the machine lacks for the kernels on ``device``; empty if nothing."""
     if importlib.util.find_spec("triton") is None:
         return "Triton is not installed; pip install 'mplicits[kernels]'"
-    if asked == "interpret":
+    if requested == "interpret":
         return "" if os.environ.get("TRITON_INTERPRET") == "1" else "TRITON_INTERPRET=1 is not set"
     if os.environ.get("TRITON_INTERPRET") == "1":
         return "TRITON_INTERPRET=1 is set; only MPLICITS_KERNELS=interpret uses the interpreter"

@@ -2,7 +2,7 @@ import torch
 from fields import cube
 from mplicits.neural_fields import Sphere
 from mplicits.neural_fields.fields.field import as_field
-from mplicits.neural_fields.networks.grids import HashEncoding, ValueGrid, grid_resolutions, spatial_hash, tables_apart
+from mplicits.neural_fields.networks.grids import HashEncoding, ValueGrid, grid_resolutions, spatial_hash, split_tables
 from torch import Tensor
 
 
@@ -78,7 +78,7 @@ def test_tables_are_told_from_all_other_parameters() -> None:
     encodings = [HashEncoding.up_to(finest) for finest in (8, 32)]
     assert [(encoding.resolutions[0], encoding.resolutions[-1]) for encoding in encodings] == [(8, 8), (16, 32)]
     readers = [torch.nn.Sequential(encoding, torch.nn.Linear(encoding.size, 3)) for encoding in encodings]
-    tables, others = tables_apart(*readers)
+    tables, others = split_tables(*readers)
     assert all(found is encoding.table for found, encoding in zip(tables, encodings, strict=True))
     assert [tuple(parameter.shape) for parameter in others] == 2 * [(3, encodings[0].size), (3,)]
 
