@@ -234,7 +234,7 @@ class NerfstudioField(Hosted):
 
     def forward_geonetwork(self, inputs: Tensor) -> Tensor:
         """Distance and features at ``inputs`` ``(..., 3)`` → ``(..., 1 + F)``; without a graph a value only."""
-        if not torch.is_grad_enabled():  # as the host's exporters ask, who want the distance
+        if not torch.is_grad_enabled():  # the host's exporters, which need the distance only
             return self._value_features(inputs)
         return self._memo.ask("value", inputs, self.field, lambda: self._evaluate(inputs))
 

@@ -45,10 +45,10 @@ def parameter_groups(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -
     """
     positive(lr=lr)
     groups, taken = [], set()
-    for siren, rates in _wanted(field, pace):
+    for siren, rates in _siren_rates(field, pace):
         parts = list(siren.layers.parameters()), list(siren.output.parameters())
-        for params, wanted, unit in zip(parts, rates, siren.units, strict=True):
-            groups.append({"params": params, "lr": lr / HOST_RATE * wanted / unit})
+        for params, rate, unit in zip(parts, rates, siren.units, strict=True):
+            groups.append({"params": params, "lr": lr / HOST_RATE * rate / unit})
             taken.update(map(id, params))
     rest = [parameter for parameter in field.parameters() if id(parameter) not in taken]
     return [*groups, {"params": rest, "lr": lr}] if rest else groups
@@ -79,12 +79,12 @@ def rescale_parameters(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0)
         ((0.25, 0.25), True)
     """
     positive(lr=lr)
-    for siren, rates in _wanted(field, pace):
-        sines, output = (2.0 ** round(math.log2(wanted / lr)) for wanted in rates)
+    for siren, rates in _siren_rates(field, pace):
+        sines, output = (2.0 ** round(math.log2(rate / lr)) for rate in rates)
         siren.set_units(sines, output)
 
 
-def _wanted(field: Field, pace: Pace) -> Iterator[tuple[Siren, tuple[float, float]]]:
+def _siren_rates(field: Field, pace: Pace) -> Iterator[tuple[Siren, tuple[float, float]]]:
     """Each SIREN with Adam's rates for its sine layers and for its output."""
     paces = [pace] if isinstance(pace, float | int) else list(pace)
     for share in paces:

@@ -247,7 +247,7 @@ def choose_levels(levels: Sequence[Field], x: Tensor, *, jet: bool) -> Choice:
     if len(networks) < len(levels):
         return Choice(False, "a level is no SIREN")
     if any((network.like.dtype, network.like.device) != (x.dtype, x.device) for network in networks):
-        return Choice(False, "points and networks differ in precision or device, which PyTorch will say")
+        return Choice(False, "points and networks differ in precision or device; PyTorch reports it")
     return choose(
         x,
         width=max(network.width for network in networks),
@@ -317,10 +317,10 @@ def _walk_on(
             joined = join(parts, evaluate(level, points), delta)
             parts = _where(inside, joined, parts)
         else:
-            some = Rows(rows, count, full=False)  # places that are left over get the last point, and
-            joined = join(tuple(map(some.of, parts)), evaluate(level, some.of(points)), delta)
+            band = Rows(rows, count, full=False)  # surplus places evaluate the last point,
+            joined = join(tuple(map(band.of, parts)), evaluate(level, band.of(points)), delta)
             parts = tuple(
-                torch.cat((part, part[:1])).index_copy(0, rows, new)[:count]  # what they find goes behind it
+                torch.cat((part, part[:1])).index_copy(0, rows, new)[:count]  # and their values are cut off
                 for part, new in zip(parts, joined, strict=True)
             )
         yield parts
@@ -413,10 +413,10 @@ def solve_sphere(
     rows = torch.cat(
         (torch.cat((sines, torch.ones_like(lengths)), dim=1), *slope_weight**0.5 * torch.cat((slopes, flat), dim=2))
     )
-    wanted = torch.cat((lengths[:, 0] - radius, *(slope_weight**0.5 * direction.t())))
+    target = torch.cat((lengths[:, 0] - radius, *(slope_weight**0.5 * direction.t())))
     damping = torch.full((network.width + 1,), ridge * len(lengths), dtype=rows.dtype, device=rows.device)
-    damping[-1] = 0  # a bias may be as large as it likes
-    solved = torch.linalg.solve(rows.t() @ rows + damping.diag(), rows.t() @ wanted).to(first.weight)
+    damping[-1] = 0  # the bias is not damped
+    solved = torch.linalg.solve(rows.t() @ rows + damping.diag(), rows.t() @ target).to(first.weight)
     network.output.weight[0] = solved[:-1]
     network.output.bias[0] = solved[-1]
     network.set_units(*units)

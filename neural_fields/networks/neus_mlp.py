@@ -70,7 +70,7 @@ class NeusSDF(OneLevelField):
                 continue
             layer.bias.zero_()
             layer.weight.normal_(0, math.sqrt(2 / layer.out_features))
-            # Sines and cosines begin without a say: only x itself has the length that the sphere needs.
+            # Weights of sines and cosines begin at 0: only x itself has the length that the sphere needs.
             if index == 0:
                 layer.weight[:, 3:] = 0
             elif index == self.joined:
@@ -108,7 +108,7 @@ class NeusSDF(OneLevelField):
             assert isinstance(layer, nn.Linear)
             if index == self.joined:
                 h = torch.cat((h, encoded), dim=1) / math.sqrt(2)
-            # Weight normalisation works its weight out anew on every access.
+            # Weight normalisation computes the weight on every access.
             weights.append(layer.weight)
             z = torch.addmm(layer.bias, h, weights[-1].t())
             if index == self.depth:

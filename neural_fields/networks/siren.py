@@ -103,7 +103,7 @@ class Siren(OneLevelField):
         """Keep the parameters in other units: their numbers change, the function and its jets do not, bit for bit.
 
         A weight W is stored as W / unit. Adam moves a stored number by the learning rate, and so W by unit times as
-        much: layers that want different rates can share one. State dicts hold W, whatever the units.
+        much: layers that need different rates can share one. State dicts hold W, whatever the units.
 
         Args:
             sines: unit of the sine layers' weights and biases, a power of two.
@@ -515,6 +515,6 @@ def _differentiable_backward(
     needed: Sequence[bool], inputs: Sequence[Tensor], outputs: Sequence[Tensor], cotangents: Sequence[Tensor | None]
 ) -> tuple[Tensor | None, ...]:
     """Cotangents of the inputs that need one, by autograd, which can differentiate them again."""
-    wanted = [tensor for tensor, need in zip(inputs, needed, strict=True) if need]
-    found = iter(torch.autograd.grad(outputs, wanted, cotangents, create_graph=True, materialize_grads=True))
+    chosen = [tensor for tensor, need in zip(inputs, needed, strict=True) if need]
+    found = iter(torch.autograd.grad(outputs, chosen, cotangents, create_graph=True, materialize_grads=True))
     return tuple(next(found) if need else None for need in needed)

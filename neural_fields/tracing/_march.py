@@ -148,7 +148,7 @@ class Rays(NamedTuple):
         """Which rays were first evaluated ahead of their start, and are behind the surface there, by the ``value``."""
         # Evaluated at the hit itself, half of all rays that meet it are behind it by less than the tolerance.
         arrived = (value >= -rule.tolerance * self.fall) & (self.expected - self.depth <= rule.resolution)
-        # A ray that knows the value at its start has the surface between the two.
+        # Where the value at the start is known, the surface lies between the two points.
         return (self.depth > self.low) & (value < 0) & ~arrived & self.low_value.isinf()
 
     def began_behind(self, value: Tensor) -> Tensor:
@@ -238,11 +238,11 @@ def step(rays: Rays, value: Tensor, rule: Rule, resolution: Tensor | float) -> t
     """Take in the ``value`` at ``rays.depth``, and compute the next depth to evaluate."""
     level, delta = rule.band(value.abs())
     free = ((value.abs() - delta) / rule.lipschitz).clamp(min=0)
-    # Before there are two values: a hit that is expected ahead says how steep the way there is, or else it is head-on.
+    # With one value only: the slope to the expected hit, or else that of a head-on ray.
     way = rays.expected - rays.depth
-    foretold = torch.where(way > resolution, -value / way, -rays.fall)
-    foretold = torch.where(rays.expected.isfinite(), foretold, -1.0)
-    slope = torch.where(rays.low_value.isfinite(), (value - rays.low_value) / (rays.depth - rays.low), foretold)
+    predicted = torch.where(way > resolution, -value / way, -rays.fall)
+    predicted = torch.where(rays.expected.isfinite(), predicted, -1.0)
+    slope = torch.where(rays.low_value.isfinite(), (value - rays.low_value) / (rays.depth - rays.low), predicted)
     enclosed = rays.high.isfinite()
     sound = enclosed | (rays.depth - rays.low - rays.free - free <= rays.gap)
     before, behind = sound & (value > 0), sound & (value <= 0)

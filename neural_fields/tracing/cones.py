@@ -135,7 +135,7 @@ def _march_cones(
         (axis, sigma, leave), (depth, before, value_before) = fixed, moving
         t = torch.where(on, depth, 0)  # those that have left are at infinity
         value = field.value(origin + t[:, None] * axis, level=0)
-        # Behind the surface? Then the field is steeper than it was said to be: back, and leave it to the rays.
+        # Behind the surface, the field was steeper than ``lipschitz``: step back, and leave it to the rays.
         passed = value * value_before < 0
         step = ((value.abs() - delta) / lipschitz - t * sigma) / (1 + sigma)
         ahead = torch.where(passed, before, t + step.clamp(min=0))

@@ -251,23 +251,23 @@ def render_samples(
         flat = tensor.flatten(0, 1)
         return flat if rows is None else rows.of(flat)
 
-    def in_place(found: Tensor) -> Tensor:
-        """The way back; 0 in intervals that were skipped."""
-        shape = (*depths.shape, *found.shape[1:])
-        return (found if rows is None else rows.back(found)).reshape(shape)
+    def in_place(values: Tensor) -> Tensor:
+        """``(K, …)`` → ``(R, S, …)``, 0 in intervals that were skipped."""
+        shape = (*depths.shape, *values.shape[1:])
+        return (values if rows is None else rows.back(values)).reshape(shape)
 
     points = gathered(ray_points(origins, directions, depths))  # (K, 3)
     along = gathered(directions[:, None].expand(-1, depths.shape[1], -1))
     with nullcontext() if rows is None else rows.masked():
-        found = field.jet(points, level=level)
-    slope = (found.gradient * along).sum(dim=-1)
-    optical = neus_optical_depth(found.value, slope, gathered(interval), inv_std, cos_anneal=cos_anneal)
+        flat = field.jet(points, level=level)
+    slope = (flat.gradient * along).sum(dim=-1)
+    optical = neus_optical_depth(flat.value, slope, gathered(interval), inv_std, cos_anneal=cos_anneal)
     weights, remaining = transmittance_weights(in_place(optical))
     mask = None
     if early_stop_eps > 0:
         mask = gathered(weights.detach()) > early_stop_eps
         mask = mask if rows is None or rows.full else mask & rows.used
-    mixed = composite(weights, in_place(_colors(color, points, along, found, mask)))
+    mixed = composite(weights, in_place(_colors(color, points, along, flat, mask)))
     if outside is not None:
         through = chosen("outside", remaining.detach() > early_stop_eps)
         eyes, along, ends, light = (through.of(tensor) for tensor in (origins, directions, t_ends[:, -1], remaining))
@@ -276,7 +276,7 @@ def render_samples(
         mixed = mixed + through.back(light[:, None] * behind)
     elif background is not None:
         mixed = mixed + remaining[:, None] * background
-    jet = Jet(*(in_place(part) for part in found))
+    jet = Jet(*(in_place(part) for part in flat))
     normals = torch.nn.functional.normalize(jet.gradient, dim=-1)
     depth, normal = (weights * depths).sum(dim=1), composite(weights, normals)
     return Rendered(mixed, 1 - remaining, depth, normal, weights, depths, jet, counts)
@@ -314,8 +314,8 @@ def sample_depths(
             more = importance_depths(depths, values, count, sharpness, generator=generator)
             depths, order = torch.cat((depths, more), dim=1).sort(dim=1)
             if index + 1 < sampling.rounds:
-                found = coarsest(ray_points(origins, directions, more))
-                values = torch.cat((values, found), dim=1).gather(1, order)
+                added = coarsest(ray_points(origins, directions, more))
+                values = torch.cat((values, added), dim=1).gather(1, order)
     return torch.cat((near[:, None], depths, far[:, None]), dim=1)
 
 

@@ -22,7 +22,7 @@ def neus_optical_depth(
     """Optical depth τ ≥ 0 of intervals, from the field at their middles (NeuS, Eq. 13, in logarithms).
 
     The field is extended along the ray by its slope c: f_in, f_out = f ∓ c Δ / 2. Early in training a half-open slope
-    keeps gradients alive where the surface looks away: c′ = −((1 − a) relu(½ − ½c) + a relu(−c)).
+    keeps gradients non-zero where the surface faces away: c′ = −((1 − a) relu(½ − ½c) + a relu(−c)).
 
     Args:
         value: ``(...,)`` f at the middle of each interval.
@@ -38,7 +38,7 @@ def neus_optical_depth(
         1.0
     """
     falling = -torch.relu(-slope)
-    if isinstance(cos_anneal, Tensor) or cos_anneal < 1:  # of a tensor the host does not know
+    if isinstance(cos_anneal, Tensor) or cos_anneal < 1:  # the host does not read a tensor
         falling = cos_anneal * falling - (1 - cos_anneal) * torch.relu(0.5 - 0.5 * slope)
     half = 0.5 * interval * falling
     return softplus(-inv_std * (value + half)) - softplus(-inv_std * (value - half))

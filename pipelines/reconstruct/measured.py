@@ -70,11 +70,11 @@ class MeasuredDepths:
     """The measurements of the ``views`` that are trained on, a part of the ``images``.
 
     Numbers of a map that is not in the cameras' units become depths by a scale and a shift of its own, `affine` ``(V,
-    2)``, 0 until they are known. The sparse points that the view saw say which, if there are sixteen; else `settle`
+    2)``, 0 until they are known. The sparse points that the view saw say which, if there are sixteen; else `align`
     fits them to the present surface. The ``seed`` chooses where there are more readings than can be kept.
 
     Attributes:
-        is_loose: whether there are maps for `settle`.
+        is_loose: whether there are maps for `align`.
         is_exact: whether anything was measured in the cameras' units.
 
     Raises:
@@ -125,7 +125,7 @@ class MeasuredDepths:
         return self.at(graph_input(lambda: torch.randint(len(self), (count,), generator=generator), self.device))
 
     @torch.no_grad()
-    def settle(self, distance: FieldLike) -> None:
+    def align(self, distance: FieldLike) -> None:
         """Fit scale and shift of the maps that have none yet to a field in unit-sphere coordinates."""
         loose = self.forms != AS_IT_IS
         # Of each view's readings, evenly; they lie one after the other.

@@ -1,4 +1,4 @@
-"""What ``reconstruct`` minimises: rendered rays against photographs; levels join on schedule, bands follow 1/s."""
+"""The loss of ``reconstruct``: rendered rays against photographs; levels join on schedule, bands follow 1/s."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .model import RayPool, SceneModel
 
 @dataclass(frozen=True)
 class Schedule:
-    """What happens when in the training of a scene. The values are this project's own."""
+    """The schedule of the training of a scene. The values are this project's own."""
 
     near_every: int = 16  # steps between two updates of the SDF grid near the surface, at least
     near_rest: int = 128  # the same at most, while the surface rests
@@ -39,7 +39,7 @@ class Schedule:
     poses_from: float = 0.1  # share of the training after which camera poses are refined
     pose_rate: float = 3.0  # their learning rate over the geometry's
     depth_rays: int = 256  # measured rays per step
-    settle_every: int = 64  # steps between two fits of scale and shift of depth maps to the surface
+    align_every: int = 64  # steps between two fits of scale and shift of depth maps to the surface
     faded: float = 0.5  # share of the training after which depths that were estimated from single pictures do not count
 
 
@@ -53,7 +53,7 @@ class Kind(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a step is descended by."""
+    """The losses of a step."""
 
     terms: dict[str, Tensor]  # of the loss, unweighted
     total: Tensor  # their weighted sum
@@ -61,7 +61,7 @@ class Outcome(NamedTuple):
 
 
 class SceneObjective(Objective):
-    """How far a scene is from the pixels of a pool, and from depths that were measured in the same pictures."""
+    """Losses of a scene against the pixels of a pool, and against depths measured in the same pictures."""
 
     schedule = Schedule()
 
@@ -125,7 +125,7 @@ class SceneObjective(Objective):
             self.kept |= {"moved": self.grid.moved, "looks": torch.tensor([step, pause, count + 1])}
 
     def read_back(self, step: int, samples: Tensor) -> None:
-        """Fetch what the next steps depend on, all at once: a GPU is waited for."""
+        """Read what the next steps depend on from the device in one copy, which waits for a GPU."""
         unsure = 1 / self.model.inv_std.detach()
         known = [samples, unsure.to(samples)]
         if self.grid is None:
@@ -156,15 +156,15 @@ class SceneObjective(Objective):
         return outcome.terms, outcome.total
 
     def before_step(self, step: int, done: float) -> Kind:
-        """Do what a step needs of the host first → the kind of the step."""
+        """Do the host's part of a step → the kind of the step."""
         self.done = done
         self.focus.watched(step, self.kept)
         self.refresh_grid(step, done)
         measured = self.measured
         if measured is not None:
             measured.affine = self.kept["affine"]  # that of a run which is resumed
-            if measured.is_loose and done < self.schedule.faded and step % self.schedule.settle_every == 0:
-                measured.settle(self.grid or (lambda x: self.model.geometry.value(x, level=0)))
+            if measured.is_loose and done < self.schedule.faded and step % self.schedule.align_every == 0:
+                measured.align(self.grid or (lambda x: self.model.geometry.value(x, level=0)))
                 self.kept["affine"] = measured.affine
         return Kind(
             rays=self.batch(),
@@ -174,7 +174,7 @@ class SceneObjective(Objective):
         )
 
     def after_step(self, step: int, samples: Tensor) -> None:
-        """Do what follows a step on the host; ``samples`` is the number evaluated per ray, 0-d."""
+        """Do the host's part after a step; ``samples`` is the number evaluated per ray, 0-d."""
         if (step + 1) % self.schedule.near_every == 0:
             self.read_back(step, samples)
 
@@ -228,7 +228,7 @@ class SceneObjective(Objective):
         return Outcome(terms, total, samples)
 
     def depth_term(self, measured: MeasuredDepths, level: int) -> Tensor:
-        """How far the surface is from what was measured: the mean of `depth_loss` over rays at random."""
+        """The mean of `depth_loss` over random rays with measured depths."""
         rays = measured.draw(self.schedule.depth_rays, self.generator)
         if self.model.poses is not None:
             origins, directions = self.model.poses.moved(rays.origins, rays.directions, rays.view)
@@ -313,7 +313,7 @@ class GraphTrainer(Trainer[SceneObjective]):
         return terms
 
     def _work(self, kind: Kind, capacities: Capacities) -> dict[str, Tensor]:
-        """A step as the device does it."""
+        """The device's part of a step."""
         objective = self.objective
         rates = graph_input(
             lambda: torch.tensor([rate(objective.done) for _, rate in objective.groups]), self.trained[0].device

@@ -132,7 +132,7 @@ def test_without_points_the_surface_fixes_the_scale(images: PosedImages, kind: D
     assert measured.is_loose
     nothing = depth_loss(EXACT, measured.at(torch.arange(len(measured))))
     assert float(nothing.abs().max()) == 0  # before they are known
-    measured.settle(EXACT.value)
+    measured.align(EXACT.value)
     np.testing.assert_allclose(measured.affine[:, 0], scales, rtol=0.02)
     assert float(EXACT.value(ends(measured)).abs().median()) < 2e-3
 

@@ -192,14 +192,14 @@ def test_measured_depths_bring_the_surface_nearer() -> None:
 def test_maps_without_a_scale_are_fitted_to_the_surface_and_fade(monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = make(relative(), replace(TINY, steps=8, depth_weight=1.0), depths=True)
     fitted: list[int] = []
-    settle = MeasuredDepths.settle
+    align = MeasuredDepths.align
 
     def counted(self: MeasuredDepths, distance: Callable[[Tensor], Tensor]) -> None:
         fitted.append(trainer.step)
-        settle(self, distance)
+        align(self, distance)
 
-    monkeypatch.setattr(MeasuredDepths, "settle", counted)
-    monkeypatch.setattr(SceneObjective, "schedule", Schedule(settle_every=2))
+    monkeypatch.setattr(MeasuredDepths, "align", counted)
+    monkeypatch.setattr(SceneObjective, "schedule", Schedule(align_every=2))
     train(trainer)
     assert fitted == [0, 2]  # not in the second half, where they do not count
     assert bool((trainer.objective.kept["affine"][:, 0] > 0).any())
