@@ -31,7 +31,7 @@ class FusionOptions:
     typical: float = 0.99  # share of the points nearer than the typical depth
     stray: float = 1.5  # furthest over typical depth from which the report suggests --max-depth
     tolerance: float = 0.03  # of the depth, by which a point is in front of a frame's surface, or on it
-    visibility_frames: int = 12  # frames that each point is projected into, for linear time
+    views: int = 12  # frames that each point is projected into, for linear time
     room: int = 2  # points that are kept for the vote, over those that stay
 
 
@@ -175,13 +175,13 @@ def frame_cloud(frame: RgbdFrame, settings: DepthSettings | None = None) -> tupl
     return cloud, report
 
 
-@partial(renamed, witnesses="visibility_frames")
+@partial(renamed, witnesses="views")
 def fuse_frames(
     frames: Iterable[RgbdFrame],
     settings: DepthSettings | None = None,
     *,
     tolerance: float = FUSION.tolerance,
-    visibility_frames: int = FUSION.visibility_frames,
+    views: int = FUSION.views,
 ) -> tuple[PointCloud, DepthReport]:
     """Join one or more depth maps in world coordinates → a cloud and a report.
 
@@ -193,17 +193,15 @@ def fuse_frames(
             iterable that reads its frames needs memory for one.
         settings: of the cleaning; ``max_points`` is for all frames together.
         tolerance: relative difference of depths up to which a frame sees the same point.
-        visibility_frames: number of other frames, spread evenly, in which the visibility of a point is tested.
+        views: number of other frames, spread evenly, in which the visibility of a point is tested.
 
     Raises:
         InputError: there are no frames, nothing is left, or only some frames have colours.
-        ValueError: ``tolerance`` is not in (0, 1), ``visibility_frames`` is negative, or ``frames`` is an iterator.
+        ValueError: ``tolerance`` is not in (0, 1), ``views`` is negative, or ``frames`` is an iterator.
     """
     settings = settings or DepthSettings()
-    if not 0 < tolerance < 1 or visibility_frames < 0:
-        raise ValueError(
-            f"tolerance={tolerance}, visibility_frames={visibility_frames}: expected one in (0, 1) and one >= 0"
-        )
+    if not 0 < tolerance < 1 or views < 0:
+        raise ValueError(f"tolerance={tolerance}, views={views}: expected one in (0, 1) and one >= 0")
     if isinstance(frames, Iterator):
         raise ValueError("frames: an iterator, which ends after one pass; expected a list, or what begins anew")
     pool = _Pool(settings)
@@ -212,8 +210,8 @@ def fuse_frames(
     if not reports:
         raise InputError("frames: none given; name at least one depth map")
     (cloud, owner), seen_through = pool.joined(), 0
-    if len(reports) > 1 and visibility_frames:
-        others = _other_frames(len(reports), visibility_frames)
+    if len(reports) > 1 and views:
+        others = _other_frames(len(reports), views)
         votes = partial(_votes, cloud.points, owner, others, tolerance)
         through = sum(map(votes, count(), frames), np.zeros(len(cloud), np.int64))
         seen_through = int((through > 0).sum())

@@ -59,11 +59,9 @@ class _Chunk:
         if self.field.same_rows:
             with fixed_shapes(capacity) as shapes:
                 for _ in range(passes):
-                    shapes.mask = ~self.ended
+                    there = shapes.mask = ~self.ended
                     value = self._values()
-                    self._pass(
-                        value, shapes.mask if shapes.overflow is None else shapes.mask & ~shapes.overflow, hits, reach
-                    )
+                    self._pass(value, there if shapes.overflow is None else there & ~shapes.overflow, hits, reach)
             requested = shapes.requested
         else:  # a field that is evaluated at other rows could not tell which rows overflow
             for _ in range(passes):

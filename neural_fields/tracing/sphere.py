@@ -239,8 +239,7 @@ def _march_fused(field: Field, level: int, spans: Sequence[Tensor], hits: RayHit
     numbers = starts.new_tensor([rule.tolerance, rule.resolution, rule.lipschitz])
     rays = RayTensors(origins, directions, starts, entries, ends)
     march_fused(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=march_constants(starts.dtype))
-    mask, depth, steps, slope, own = marched.in_own_types()
-    hits.mask, hits.depth, hits.level, hits.steps, hits.slope = mask, depth, own, steps, slope
+    hits.mask, hits.depth, hits.steps, hits.slope, hits.level = marched.in_own_types()
 
 
 def _begin(

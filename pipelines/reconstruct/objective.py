@@ -150,8 +150,7 @@ class SceneObjective(Objective):
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
-        kind = self.before_step(step, done)
-        outcome = self.evaluate(kind)
+        outcome = self.evaluate(self.before_step(step, done))
         self.after_step(step, outcome.samples)
         return outcome.terms, outcome.total
 
@@ -305,8 +304,7 @@ class GraphTrainer(Trainer[SceneObjective]):
         terms = dict(self.graphs.run((kind, capacities), lambda: self._work(kind, capacities)))
         # A replay changes parameters behind PyTorch's back; the fused kernels pack them again by their versions.
         torch.autograd.graph.increment_version(self.trained)
-        samples = terms.pop("samples")
-        self.objective.after_step(self.step, samples)
+        self.objective.after_step(self.step, terms.pop("samples"))
         self.step += 1
         if self.step % self.objective.schedule.near_every == 0:
             self._read_requested(kind)
@@ -332,8 +330,7 @@ class GraphTrainer(Trainer[SceneObjective]):
             self.peaks[-1] += overflow
         self.adam.found_inf = overflow  # pyright: ignore[reportAttributeAccessIssue]  of a step that is not taken it is 1
         self.descend(outcome.total)
-        terms = {name: term.detach() for name, term in outcome.terms.items()}
-        return terms | {"samples": outcome.samples}
+        return {name: term.detach() for name, term in outcome.terms.items()} | {"samples": outcome.samples}
 
     def _requested(self, shapes: FixedShapes) -> Tensor:
         """How many rows were to be chosen, of `CHOICES` and in each band."""

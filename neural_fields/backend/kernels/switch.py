@@ -46,8 +46,7 @@ def choose(x: Tensor, *, width: int, depth: int, features: int = 0, levels: int 
 
     ``width`` and ``depth`` are the largest of all; ``features`` is the number of outputs requested besides the value.
     """
-    requested = mode()
-    reason = ""
+    requested, reason = mode(), ""
     if requested == "off":
         reason = f"{VARIABLE}=off"
     elif requested != "interpret" and x.device.type != "cuda":

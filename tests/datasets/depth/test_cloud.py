@@ -241,7 +241,7 @@ def test_fusion_thins_what_several_frames_saw():
     assert 1200 <= len(few) <= 1500
     assert report.thinned == len(every) - len(few)
     assert np.isin(few.points, every.points).all()
-    assert fuse_frames(frames, EXACT, visibility_frames=2)[1].seen_through == 0
+    assert fuse_frames(frames, EXACT, views=2)[1].seen_through == 0
 
 
 class Watched:
