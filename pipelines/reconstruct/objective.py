@@ -319,8 +319,7 @@ class GraphTrainer(Trainer[SceneObjective]):
         for group, rate in zip(self.adam.param_groups, rates.unbind(), strict=True):
             group["lr"] = rate
         given = capacities or ()
-        named = dict(zip(CHOICES, given, strict=False))
-        with fixed_shapes(given[len(CHOICES) :], named_capacity=named) as shapes:
+        with fixed_shapes(given[len(CHOICES) :], named_capacity=dict(zip(CHOICES, given, strict=False))) as shapes:
             outcome = objective.evaluate(kind)
         with torch.no_grad():
             requested = self._requested(shapes)
