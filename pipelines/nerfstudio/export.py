@@ -19,7 +19,7 @@ from ...neural_fields.meshing.mesh import check_mesh_path
 from ..mesh.bake import check_texture_size, textured_mesh
 from ..mesh.extract import normals_near
 from ..mesh.files import check_textured_path
-from ..reconstruct.views import seen_points
+from ..reconstruct.views import visible_points
 from ..surface.surface import Support, seen_part
 
 __all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "part_seen"]
@@ -159,7 +159,7 @@ def part_seen(mesh: Mesh, field: NerfstudioField, cameras: Sequence[Camera]) -> 
         NoSurfaceError: nothing of it.
     """
     unit = Similarity((0.0, 0.0, 0.0), 1 / field.scale)
-    points, within = seen_points(field.field, [(camera.moved(unit), None) for camera in cameras])
+    points, within = visible_points(field.field, [(camera.moved(unit), None) for camera in cameras])
     part = None
     if len(points):
         moved = dataclasses.replace(mesh, vertices=mesh.vertices * field.scale)

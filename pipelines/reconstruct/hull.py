@@ -82,7 +82,7 @@ class Agreement:
 
     views: Sequence[PosedImage]  # pictures, all with masks
     similarity: Similarity  # from world to unit-sphere coordinates
-    seen: Tensor  # (V, N) which points of a grid in the unit ball each view sees
+    visible: Tensor  # (V, N) visibility of the points of a grid in the unit ball, in each view
     against: Tensor  # (V, N) which of them it contradicts
     limits: Limits = Limits()  # when a silhouette is wrong
 
@@ -90,9 +90,9 @@ class Agreement:
     def of(cls, views: Sequence[PosedImage], similarity: Similarity, limits: Limits | None = None) -> Agreement:
         """Compare views at the points of the grid."""
         limits = limits or Limits()
-        told = list(silhouettes(views, similarity, grid_in_ball(limits.cells)[0], 2 / limits.cells))
-        seen, objects = (torch.stack(parts) for parts in zip(*told, strict=True))
-        return cls(views, similarity, seen, seen & ~objects, limits)
+        masks = list(silhouettes(views, similarity, grid_in_ball(limits.cells)[0], 2 / limits.cells))
+        visible, objects = (torch.stack(parts) for parts in zip(*masks, strict=True))
+        return cls(views, similarity, visible, visible & ~objects, limits)
 
     def without(self, some: Sequence[PosedImage]) -> Agreement:
         """That of the other views."""
@@ -101,7 +101,7 @@ class Agreement:
         left_out = {id(view) for view in some}
         rows = [row for row, view in enumerate(self.views) if id(view) not in left_out]
         views = [self.views[row] for row in rows]
-        return Agreement(views, self.similarity, self.seen[rows], self.against[rows], self.limits)
+        return Agreement(views, self.similarity, self.visible[rows], self.against[rows], self.limits)
 
     @cached_property
     def is_inverted(self) -> bool:
@@ -116,14 +116,14 @@ class Agreement:
 
         None where all masks are inverted.
         """
-        times, count = self.against.sum(dim=0), self.seen.sum(dim=0)
-        agreed = self._seen_by_enough & (times <= self.limits.agreed * count)
-        shares = (self.against & agreed).sum(dim=1) / (self.seen & agreed).sum(dim=1).clamp(min=1)
+        times, count = self.against.sum(dim=0), self.visible.sum(dim=0)
+        agreed = self._enough_views & (times <= self.limits.agreed * count)
+        shares = (self.against & agreed).sum(dim=1) / (self.visible & agreed).sum(dim=1).clamp(min=1)
         wrong = (shares > self.limits.wrong) | (self._bare > self.limits.wrong)
         return [] if self.is_inverted else self._those(wrong)
 
     def outliers(self) -> list[PosedImage]:
-        """`contradictions`, if they are a tenth of the views at most: nothing says which of more are right."""
+        """`contradictions`, if they are a tenth of the views at most: with more, it is unknown which are right."""
         odd = self.contradictions()
         return odd if len(odd) <= self.limits.most_wrong * len(self.views) else []
 
@@ -152,8 +152,8 @@ class Agreement:
     @cached_property
     def _bare(self) -> Tensor:
         """Share of the object's pixels with no visual hull behind them, to a cell of it ``(V,)``."""
-        most = (self.limits.sure * self.seen.sum(dim=0)).clamp(min=1)  # one wrong view of few may not take the hull
-        agreed = self._seen_by_enough & (self.against.sum(dim=0) <= most)
+        most = (self.limits.sure * self.visible.sum(dim=0)).clamp(min=1)  # one wrong view of few may not take the hull
+        agreed = self._enough_views & (self.against.sum(dim=0) <= most)
         hull, shares = grid_in_ball(self.limits.cells)[0][agreed], []
         for view in self.views:
             mask = _object_in(view)
@@ -164,13 +164,13 @@ class Agreement:
     def _cuts_alone(self) -> Tensor:
         """Which of many views contradict much that no other one does ``(V,)``."""
         times = self.against.sum(dim=0)
-        hull = ((times == 0) & self.seen.any(dim=0)).sum().clamp(min=1)
+        hull = ((times == 0) & self.visible.any(dim=0)).sum().clamp(min=1)
         share = (self.against & (times == 1)).sum(dim=1) / hull
         return (share > self.limits.lone) & (len(self.views) >= self.limits.few) & (not self.is_inverted)
 
     @property
-    def _seen_by_enough(self) -> Tensor:
-        return self.seen.sum(dim=0) >= max(1.0, self.limits.agreed * len(self.views))
+    def _enough_views(self) -> Tensor:
+        return self.visible.sum(dim=0) >= max(1.0, self.limits.agreed * len(self.views))
 
     def _those(self, which: Tensor) -> list[PosedImage]:
         return [view for view, is_meant in zip(self.views, which.tolist(), strict=True) if is_meant]
@@ -205,7 +205,7 @@ def named(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def seen_through(measured: MeasuredDepths, resolution: int, *, rays: int = 1 << 18, least: int = 2) -> Tensor:
+def free_space(measured: MeasuredDepths, resolution: int, *, rays: int = 1 << 18, least: int = 2) -> Tensor:
     """Which vertices of a grid over [−1, 1]³ measured rays pass ``(resolution + 1,) * 3``, on the CPU.
 
     A vertex is passed where at least ``least`` of up to ``rays`` rays go through the cell around it before they end
@@ -251,11 +251,11 @@ class HullOptions:
     # share of the views that must take a point for object: through a gap often one camera looks alone
     agree: float = 0.99
     seeing: float = 0.25  # share of all views that must see it
-    room: float = 3.0  # edges of a cell within which a coarse vertex must see object, to have finer ones tried
+    margin: float = 3.0  # edges of a cell within which a coarse vertex must see object, to have finer ones tried
     least: float = 1e-3  # share of the unit ball that a hull fills at least
     most: float = 0.5  # the same at most, of silhouettes
-    # the same of what no measured ray passes: of a scene that is seen from one side, much is not seen
-    most_unseen: float = 0.9
+    # the same of what no measured ray passes: much of a scene is hidden from cameras on one side
+    most_hidden: float = 0.9
     steps: int = 250  # of Adam, in which the network learns the distances
     batch: int = 1024  # points per step
     rate: float = 2e-3  # of Adam, at first
@@ -286,7 +286,7 @@ def begin(
     masked = all(view.mask is not None for view in views) and config.start != "depths"
     carving = None if config.start == "hull" else measured
     if config.start != "sphere" and isinstance(base, Siren) and (masked or carving is not None):
-        empty = None if carving is None else seen_through(carving, HULL.resolution).numpy()
+        empty = None if carving is None else free_space(carving, HULL.resolution).numpy()
         carved = (agreement or Agreement.of(views, images.similarity)).trusted() if masked else ()
         distances = carve(carved, images.similarity, empty=empty)
         if distances is not None:
@@ -326,7 +326,7 @@ def carve(
     solid, ball = _object_vertices(views, similarity, resolution)
     if empty is not None:
         solid &= ~_all_around(empty, resolution)
-    if not HULL.least < solid.sum() / ball < (HULL.most if views else HULL.most_unseen):
+    if not HULL.least < solid.sum() / ball < (HULL.most if views else HULL.most_hidden):
         return None
     # The surface lies half a cell from the outermost vertices inside.
     outer, inner = (np.asarray(distance_transform_edt(part), dtype=np.float64) for part in (~solid, solid))
@@ -366,7 +366,7 @@ def _object_vertices(
             among = torch.from_numpy(near[:count, :count, :count].reshape(-1))[places]
             points, places = points[among], places[among]
         if views:
-            places = places[_agreed(views, similarity, points, 2 / size * (1 if size == resolution else HULL.room))]
+            places = places[_agreed(views, similarity, points, 2 / size * (1 if size == resolution else HULL.margin))]
         solid = np.zeros(count**3, dtype=bool)
         solid[places.numpy()] = True
         solid = solid.reshape(count, count, count)
@@ -375,11 +375,11 @@ def _object_vertices(
 
 def _agreed(views: Sequence[PosedImage], similarity: Similarity, points: Tensor, edge: float) -> Tensor:
     """Which points ``(N, 3)`` are object for enough of the views that see them, if enough do ``(N,)``."""
-    seen, object_in = torch.zeros(len(points)), torch.zeros(len(points))
+    visible, object_in = torch.zeros(len(points)), torch.zeros(len(points))
     for sees, objects in silhouettes([view for view in views if view.mask is not None], similarity, points, edge):
-        seen += sees
+        visible += sees
         object_in += objects
-    return (object_in >= HULL.agree * seen) & (seen >= max(1.0, HULL.seeing * len(views)))
+    return (object_in >= HULL.agree * visible) & (visible >= max(1.0, HULL.seeing * len(views)))
 
 
 def _all_around(empty: NDArray[np.bool_], resolution: int) -> NDArray[np.bool_]:

@@ -198,7 +198,7 @@ def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: tor
     near, far = sphere_span(origins, directions)
     on_surface = (reach > near) & (reach < far)
     end = torch.minimum(reach, far)
-    seen_through = end > near
+    passed = end > near
     part = uniform(reach.shape, generator, end.device) if generator else torch.full_like(reach, 0.5)
     on_the_way = torch.stack((end - (end - near) * part.square(), near))
     places = origins + torch.cat((reach[None], on_the_way))[..., None] * directions  # (3, B, 3)
@@ -206,7 +206,7 @@ def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: tor
     values = field.value(places, level=level)
     on, before = values[0], values[1:]
     free = ((-before).clamp_min(0) + (before - (reach - on_the_way)).clamp_min(0)).sum(dim=0)
-    return torch.where(on_surface, on.abs(), 0.0) + torch.where(seen_through, free, 0.0)
+    return torch.where(on_surface, on.abs(), 0.0) + torch.where(passed, free, 0.0)
 
 
 def _gathered(views: Sequence[PosedImage], images: PosedImages, random: np.random.Generator) -> list[_Part]:

@@ -169,12 +169,12 @@ def _enlarged(picture: Image, least: int = 600) -> Image:
     return picture.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
-SeenFrom = tuple[Camera, NDArray[np.float32] | None]
+MaskedCamera = tuple[Camera, NDArray[np.float32] | None]
 """A camera in unit-sphere coordinates, and the mask ``(H, W)`` of its picture, which says what is object."""
 
 
 @torch.no_grad()
-def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]:
+def visible_points(field: Field, views: Sequence[MaskedCamera]) -> tuple[Tensor, float]:
     """Points ``(N, 3)`` of the surface with a view count of at least two, on the CPU, and the distance of neighbours.
 
     Every view is traced in up to 10,000 pixels of what its mask calls object, and all together in 300,000. Places are

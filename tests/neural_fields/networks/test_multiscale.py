@@ -56,9 +56,9 @@ def test_every_level_is_evaluated_once_and_only_in_its_band(method: str, level: 
     METHODS[method](field, x, level)
     # The band of a level is that of the coarser ones.
     needed = level if method == "in_band" else level + 1
-    asked = [count if index < needed else 0 for index, count in enumerate(rows)]
+    requested = [count if index < needed else 0 for index, count in enumerate(rows)]
     jets = method in ("jet", "second_jet")
-    assert [watched.counts() for watched in levels] == [(0, count) if jets else (count, 0) for count in asked]
+    assert [watched.counts() for watched in levels] == [(0, count) if jets else (count, 0) for count in requested]
 
 
 def test_no_row_in_the_band() -> None:

@@ -131,7 +131,7 @@ def test_every_field_against_a_dense_search(name):
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_hits_lie_on_the_level_that_was_asked_for(level):
+def test_hits_lie_on_the_requested_level(level):
     field = nf.MultiscaleSDF(nf.Sphere(radius=0.5), small_multiscale().levels[1:], [0.3, 0.2], taper=0.5)
     field = field.double().requires_grad_(False)
     origins, directions = random_rays(300, spread=0.3)
@@ -152,10 +152,10 @@ def test_residuals_are_evaluated_only_in_their_band():
     field = nf.MultiscaleSDF(base, [residual], [0.05]).double()
     origins, directions = random_rays(500, spread=0.5)
     hits = nf.sphere_trace(field, origins, directions, lipschitz=1.4)
-    steps, asked = int(hits.steps.sum()), torch.cat(residual.values)
+    steps, evaluated = int(hits.steps.sum()), torch.cat(residual.values)
     assert base.counts() == (steps, 0)  # once for each step, whatever the levels
-    assert 0 < len(asked) < 0.7 * steps
-    assert float(base.inner.value(asked).abs().max()) < 0.05
+    assert 0 < len(evaluated) < 0.7 * steps
+    assert float(base.inner.value(evaluated).abs().max()) < 0.05
 
 
 def test_near_and_far_bound_the_search():

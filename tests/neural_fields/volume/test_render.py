@@ -174,16 +174,16 @@ class TestBands:
         assert float((values[hit].abs() < 0.001).float().mean()) < 0.2
 
     def test_light_samples_get_no_colour(self) -> None:
-        asked: list[int] = []
+        evaluated: list[int] = []
 
         def color(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
-            asked.append(len(x))
+            evaluated.append(len(x))
             return position_color(x, direction, jet)
 
         field = self.field()
         everywhere = render_volume(field, color, *rays(50), inv_std=200.0)
         only = render_volume(field, color, *rays(50), inv_std=200.0, early_stop_eps=1e-4)
-        assert asked[1] < 0.6 * asked[0]
+        assert evaluated[1] < 0.6 * evaluated[0]
         torch.testing.assert_close(only.color, everywhere.color, atol=1e-4 * 129, rtol=0)
         assert float((only.color - everywhere.color).detach().abs().max()) > 0
 
@@ -226,16 +226,16 @@ def test_sections_of_rays_that_miss_the_sphere_stand_for_nothing(skip: float) ->
     nothing.color.sum().backward()
 
 
-def test_what_is_behind_something_opaque_is_not_asked_for() -> None:
-    asked = []
+def test_what_is_behind_something_opaque_is_not_evaluated() -> None:
+    evaluated = []
 
     def mist(inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        asked.append(direction)
+        evaluated.append(direction)
         return torch.ones(len(inverted)), torch.ones(len(inverted), 3)
 
     options = {"inv_std": 1000.0, "outside": mist, "background": torch.zeros(3), "sampling": Sampling(outside=4)}
     seen = render_volume(Sphere(radius=0.5), red, EYES, ALONG, early_stop_eps=1e-4, **options)
-    assert torch.equal(asked[0], ALONG[1:].repeat_interleave(4, dim=0))
+    assert torch.equal(evaluated[0], ALONG[1:].repeat_interleave(4, dim=0))
     expected = render_volume(Sphere(radius=0.5), red, EYES, ALONG, **options)
     # A ray of S samples loses 1e-4 of each at most, and of the light that is left.
     torch.testing.assert_close(seen.color, expected.color, rtol=0, atol=1e-4 * (expected.weights.shape[1] + 1))

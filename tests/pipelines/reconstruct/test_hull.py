@@ -17,7 +17,7 @@ from mplicits.pipelines.reconstruct.hull import (
     begin,
     carve,
     fitting_resolution,
-    seen_through,
+    free_space,
     start_at_hull,
 )
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths
@@ -165,7 +165,7 @@ def measured_of(*, maps: bool = True) -> MeasuredDepths:
 @pytest.mark.parametrize("kind", ["maps", "points"])
 def test_rays_carve_what_is_outside_and_nothing_inside(kind: str) -> None:
     resolution = 24
-    empty = seen_through(measured_of(maps=kind == "maps"), resolution)
+    empty = free_space(measured_of(maps=kind == "maps"), resolution)
     length, cell = torch.from_numpy(lengths(resolution + 1)), 2 / resolution
     # Places of a ray, which is outside, are rounded to the next vertex: half a diagonal away at most.
     assert not bool(empty[length < RADIUS - 0.5 * 3**0.5 * cell].any())
@@ -176,6 +176,6 @@ def test_rays_carve_what_is_outside_and_nothing_inside(kind: str) -> None:
 def test_one_wrong_measurement_carves_no_hole() -> None:
     measured = measured_of()
     measured.numbers[0] *= 2  # through the sphere and far behind it
-    right, wrong = seen_through(measured_of(), 24), seen_through(measured, 24)
+    right, wrong = free_space(measured_of(), 24), free_space(measured, 24)
     assert not bool((wrong & torch.from_numpy(lengths(25) < RADIUS - 0.08)).any())
     assert int((wrong != right).sum()) < 25
