@@ -117,8 +117,8 @@ def bench(scene, tmp_path_factory) -> tuple[Path, ReconstructBench, list[Reconst
     drawn: list[torch.Tensor] = []
     draw = RayPool.draw
 
-    def spy(self, count, generator, focus=None):
-        rays = draw(self, count, generator, focus)
+    def spy(self, count, generator, sampler=None):
+        rays = draw(self, count, generator, sampler)
         drawn.append(rays.directions)
         return rays
 
