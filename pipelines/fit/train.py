@@ -33,8 +33,8 @@ from ..training.trainer import (
     restore_frozen,
     stop_on_signals,
 )
-from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
+from .densification import dense_distance
 from .level import JUDGE, LEVEL, Judge, LevelObjective, calm_omega, held_out, new_level
 from .review import review_points
 from .samples import DOMAIN, Band, Source, band_of, banded_sources, first_sources, with_wrong_sides
