@@ -205,9 +205,9 @@ def drop_unsupported(
         used = np.unique(mesh.faces)
         near, whose = KDTree(mesh.vertices[used]).query(points, distance_upper_bound=reach, workers=-1)
         own = np.bincount(of_vertex[used[np.asarray(whose)[np.isfinite(near)]]], minlength=len(whole))
-        usual = whole / max(spacing_of(np.asarray(points, np.float64)), 1e-300) ** 2
+        expected = whole / max(spacing_of(np.asarray(points, np.float64)), 1e-300) ** 2
         # Around one or two strays a fit may close a bubble as small as their spacing.
-        kept &= own >= np.minimum(3, usual / 2)
+        kept &= own >= np.minimum(3, expected / 2)
     if kept.all() or not kept.any():
         return Supported(mesh, 0, 0.0)
     return Supported(keep_faces(mesh, kept[number]), int((~kept).sum()), float(whole[~kept].sum() / whole.sum()))
