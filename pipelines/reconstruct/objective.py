@@ -17,7 +17,7 @@ from ...neural_fields.networks.grids import ValueGrid, split_tables
 from ...neural_fields.volume.render import Sampling
 from ..training.cuda_graphs import CudaGraphRecorder, GraphCache, Recorder
 from ..training.settings import ReconstructConfig
-from ..training.trainer import Focus, Group, Objective, Trainer, warm_cosine
+from ..training.trainer import ErrorWeightedSampler, Group, Objective, Trainer, warm_cosine
 from .measured import MeasuredDepths, depth_loss
 from .model import RayPool, SceneModel
 
@@ -90,8 +90,8 @@ class SceneObjective(Objective):
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
         # Recent values, on the CPU, which reads them: samples evaluated per ray, and the surface's uncertainty.
         self.kept["lately"] = torch.tensor([0.0, 1 / float(model.inv_std.detach())])
-        self.focus = Focus(len(pool), config.focus, pool.device)
-        self.kept |= self.focus.kept
+        self.sampler = ErrorWeightedSampler(len(pool), config.focus, pool.device)
+        self.kept |= self.sampler.kept
         self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
         if self.grid is not None:
             self.kept |= {
@@ -157,7 +157,7 @@ class SceneObjective(Objective):
     def before_step(self, step: int, done: float) -> Kind:
         """Do the host's part of a step → the kind of the step."""
         self.done = done
-        self.focus.watched(step, self.kept)
+        self.sampler.at_step(step, self.kept)
         self.refresh_grid(step, done)
         measured = self.measured
         if measured is not None:
@@ -186,7 +186,7 @@ class SceneObjective(Objective):
         """The losses of a fresh batch; it depends on the step only through each `graph_input`."""
         config, pool = self.config, self.pool
         self.model.widen(config.band, config.least_delta)
-        rays = pool.draw(kind.rays, self.generator, self.focus)
+        rays = pool.draw(kind.rays, self.generator, self.sampler)
         origins, directions = rays.origins, rays.directions
         if self.model.poses is not None:
             origins, directions = self.model.poses.moved(origins, directions, rays.view)
@@ -207,7 +207,7 @@ class SceneObjective(Objective):
         if pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
         wrong = (self.model.photographed(rendered, rays.view) - target).abs().mean(dim=1)
-        self.focus.learn(rays.row, wrong.detach())
+        self.sampler.learn(rays.row, wrong.detach())
         color = wrong.mean()
         # A mean over all intervals within the region, skipped ones included: some kept ones count for them.
         within = (rendered.counts > 0).any(dim=1).sum().to(wrong).clamp(min=1) * rendered.counts.shape[1]

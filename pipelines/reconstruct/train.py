@@ -210,7 +210,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         return seconds
 
     def surface_seconds(self) -> float:
-        """Seconds for what photographs see of the surface, and for its meshes, from one view and a coarse mesh."""
+        """Seconds for the visibility test and for the meshes, measured on one view and a coarse mesh."""
         started = time.monotonic()
         visible_points(self.model.geometry, self._masked_cameras()[:1])
         traced = time.monotonic()
@@ -248,7 +248,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         with reported(self.report, "what photographs see"):
             points, within = visible_points(self.model.geometry, self._masked_cameras())
             if len(points):
-                self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), seen_within=within))
+                self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), visible_within=within))
         self.model.cpu()
         texture, record["texture"] = self._texture()
         out = self.folder.out

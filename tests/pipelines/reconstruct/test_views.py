@@ -17,7 +17,7 @@ from mplicits.neural_fields.networks.grids import ValueGrid
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct import views as posed
-from mplicits.pipelines.surface.surface import Support, seen_part, thinned
+from mplicits.pipelines.surface.surface import Support, thinned, visible_part
 from reconstructions import exact_model, painted_sphere
 
 WHITE = torch.ones(3)
@@ -189,7 +189,7 @@ def share_visible(views: list[posed.MaskedCamera]) -> tuple[float, np.ndarray]:
     points, within = posed.visible_points(field, views)
     assert points.norm(dim=1).numpy() == pytest.approx(RADIUS, abs=2e-3)
     mesh = extract_mesh(field, resolution=64)
-    _, missed = seen_part(mesh, Support(points.numpy(), within, seen=True))
+    _, missed = visible_part(mesh, Support(points.numpy(), within, visible=True))
     return 1 - missed, points.numpy()
 
 
@@ -204,7 +204,7 @@ def test_two_cameras_side_by_side_see_a_cap() -> None:
     assert (points[:, 2] > RADIUS * RADIUS / DISTANCE - 1 / 32).all()
 
 
-def test_what_one_camera_or_none_sees_is_not_seen() -> None:
+def test_what_one_camera_or_none_sees_is_not_visible() -> None:
     ahead, behind = (0.0, 0.0, DISTANCE), (0.0, 0.0, -DISTANCE)
     _, points = share_visible([photograph(ahead), photograph((0.05, 0.0, DISTANCE)), photograph(behind)])
     assert (points[:, 2] > 0).all()
@@ -233,17 +233,17 @@ def test_masks_say_what_of_it_is_the_object() -> None:
     assert np.abs(points[:, 0]).max() > 0.4
 
 
-def test_the_part_that_was_seen() -> None:
+def test_the_visible_part() -> None:
     two = Union(Sphere(radius=0.2, center=(0.5, 0.0, 0.0)), Sphere(radius=0.2, center=(-0.5, 0.0, 0.0)))
     mesh = extract_mesh(two, resolution=64)
     right = mesh.vertices[mesh.vertices[:, 0] > 0].astype(np.float64)
-    kept = thinned(right, seen_within=0.01)
-    support = Support(kept["points"].double().numpy(), float(kept["seen_within"]), seen=True)
-    part, missed = seen_part(mesh, support)
+    kept = thinned(right, visible_within=0.01)
+    support = Support(kept["points"].double().numpy(), float(kept["seen_within"]), visible=True)
+    part, missed = visible_part(mesh, support)
     assert missed == pytest.approx(0.5, abs=1e-3)
     assert (part.vertices[:, 0] > 0).all()
     assert len(part.faces) == len(mesh.faces) // 2
-    assert seen_part(mesh, support._replace(points=np.array([[0.0, 0.0, 0.9]])))[0] is None
+    assert visible_part(mesh, support._replace(points=np.array([[0.0, 0.0, 0.9]])))[0] is None
 
 
 def test_seen_needs_a_run_of_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
