@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in
 from ..cameras import Camera
-from ..files import finite_number, read_json, readable, reader
+from ..files import decoded, finite_number, read_json, readable, reader
 from ..views.images import read_cameras
 from .camera import DepthCamera, read_intrinsics
 from .images import fit_color, read_color, read_depth
@@ -141,7 +141,7 @@ def _file_poses(path: Path) -> list[PosedFrame]:
     if path.suffix.lower() == ".json" or path.name == "metadata":
         return _json_poses(path)
     with readable(path):
-        text = re.sub(r"#.*", "", path.read_bytes().decode("utf-8-sig", "replace")).replace(",", " ")
+        text = re.sub(r"#.*", "", decoded(path.read_bytes())).replace(",", " ")
     lines = [line.split() for line in text.splitlines() if line.strip()]
     try:
         rows = [[float(word) for word in words] for words in lines]

@@ -78,10 +78,12 @@ class _Document:
     @classmethod
     def load(cls, path: Path) -> _Document:
         data = path.read_bytes()
-        if data[:4] != b"glTF":
-            return cls(path, json.loads(data), b"")
-        if struct.unpack_from("<I", data, 4)[0] != 2:
+        header = json.loads(data) if data[:4] != b"glTF" else None
+        old = struct.unpack_from("<I", data, 4)[0] != 2 if header is None else isinstance(header.get("meshes"), dict)
+        if old:  # its meshes have names, and no numbers
             raise InputError(f"{path}: glTF 1 is not read; export it as glTF 2")
+        if header is not None:
+            return cls(path, header, b"")
         whole, length = struct.unpack_from("<I", data, 8)[0], struct.unpack_from("<I", data, 12)[0]
         if len(data) < whole:
             raise InputError(f"{path}: is cut off after {len(data):,} of {whole:,} bytes; copy or export it again")

@@ -86,7 +86,7 @@ class _Files:
         self.lost = len(files) - len(kept)
         if not kept:
             raise InputError(f"{source.poses}: all {len(files)} poses are lost (not finite); track the cameras again")
-        files, posed, colors = ([items[k] for k in kept] for items in (files, posed, colors))
+        files, posed, colors = [files[k] for k in kept], [posed[k] for k in kept], [colors[k] for k in kept]
         cameras = _cameras(files, posed, source)
         self.parts = list(zip(files, cameras, colors, (pose for _, pose, _ in posed), strict=True))
 

@@ -376,12 +376,14 @@ def test_bad_files_are_one_line(tmp_path):
     write_mesh(tmp_path / "bare.ply", Mesh(SQUARE, FACES.astype(np.int32)))
     (tmp_path / "shape.stl").write_text("solid")
     (tmp_path / "nan.obj").write_text("v 0 0 0 1 0 0\nv 1 0 nan 1 0 0\nv 0 1 0 1 0 0\nf 1 2 3\n")
+    (tmp_path / "old.gltf").write_text('{"asset": {"version": "1.0"}, "meshes": {"cube": {"primitives": []}}}')
     for name, message in (
         ("gone.obj", "no such file"),
         ("shape.stl", r"\.obj, \.glb, \.gltf, \.ply"),
         ("cloud.ply", "face: there are none"),
         ("bare.ply", "neither a texture nor vertex colours"),
         ("nan.obj", "nan|not a finite number"),
+        ("old.gltf", "glTF 1 is not read"),
     ):
         with refused(tmp_path / name, message):
             read_textured(tmp_path / name)
