@@ -219,7 +219,7 @@ def _piece(
     uv = np.zeros((count, 2))
     key, paint = "", Paint(np.ones((1, 1, 3), np.float32))
     if textures and "material" in primitive:
-        material = document.header["materials"][primitive["material"]].get("pbrMetallicRoughness", {})
+        material = _base_color(document.header["materials"][primitive["material"]])
         info = material.get("baseColorTexture")
         if info is not None:
             uv = _texture_coordinates(document, attributes, info)
@@ -227,6 +227,15 @@ def _piece(
         paint = materials[key] if key in materials else _paint(document, material)
     materials.setdefault(key, paint)
     return _Piece(vertices, faces, uv, colors, list(materials).index(key))
+
+
+def _base_color(material: dict[str, Any]) -> dict[str, Any]:
+    """Base colour and its texture; of older materials (KHR_materials_pbrSpecularGlossiness), the diffuse ones."""
+    older = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+    if older is None or "pbrMetallicRoughness" in material:
+        return material.get("pbrMetallicRoughness", {})
+    names = {"diffuseFactor": "baseColorFactor", "diffuseTexture": "baseColorTexture"}
+    return {new: older[old] for old, new in names.items() if old in older}
 
 
 def _triangles(order: Int64, mode: int) -> Int64:

@@ -256,6 +256,16 @@ def test_gltf_factor_is_light(tmp_path, grey):
     np.testing.assert_allclose(at(mesh, 0.5, 0.5), [linear_to_srgb(light)], atol=1e-6)
 
 
+def test_gltf_diffuse_colours_of_older_materials(tmp_path):
+    header, body = gltf(image=QUARTERS, factor=(1.0, 0.5, 0.25))
+    wanted = read_textured(write_gltf(tmp_path / "new.glb", header, body))
+    base = header["materials"][0].pop("pbrMetallicRoughness")
+    diffuse = {"diffuseFactor": base["baseColorFactor"], "diffuseTexture": base["baseColorTexture"]}
+    header["materials"][0]["extensions"] = {"KHR_materials_pbrSpecularGlossiness": diffuse}
+    found = read_textured(write_gltf(tmp_path / "old.glb", header, body))
+    np.testing.assert_array_equal(found.image, wanted.image)
+
+
 @pytest.mark.parametrize("kind", ["<f4", "<u2", "u1"])
 def test_gltf_vertex_colours_are_light(tmp_path, kind):
     light = np.array([(1, 0.5, 0.2, 1)] * 6)
