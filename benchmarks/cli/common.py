@@ -31,21 +31,21 @@ def run_benches(
 
     Args:
         arguments: of the command.
-        benches: each with its own cells.
+        benches: each with its own jobs.
         out: folder of the results; None keeps nothing.
-        streams: cells at a time, see `run_streams`.
+        streams: jobs at a time, see `run_streams`.
     """
     from mplicits.pipelines.training.folder import locked
     from mplicits.pipelines.training.progress import progress_bars
     from mplicits.pipelines.training.trainer import Interrupted
 
     from ..harness.benchmark import write_results
-    from ..harness.cells import Catalogue, make_folder
+    from ..harness.jobs import Registry, make_folder
     from ..harness.report import as_text
-    from ..harness.run import run_cells
+    from ..harness.run import run_pending
 
-    planned = [(bench, bench.cells()) for bench in benches]
-    cells = [cell for _, own in planned for cell in own]
+    planned = [(bench, bench.jobs()) for bench in benches]
+    jobs = [job for _, own in planned for job in own]
     code = 0
     with ExitStack() as stack:
         folder = out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -54,10 +54,10 @@ def run_benches(
         try:
             with progress_bars() as bars:
                 heard = {"say": _say, "progress": bars, "tell": _say}
-                ran = run_cells(cells, folder, Catalogue(benches), streams=streams, device=benches[0].device, **heard)
+                ran = run_pending(jobs, folder, Registry(benches), streams=streams, device=benches[0].device, **heard)
             code = 1 if ran.failures else 0
         except (Interrupted, KeyboardInterrupt):
-            kept = "; the same command goes on after the last finished cell" if out else ""
+            kept = "; the same command goes on after the last finished job" if out else ""
             print(f"interrupted{kept}", file=sys.stderr)
             code = 130
         tables, figures = write_results(planned, folder, command=typed(arguments))
@@ -92,7 +92,7 @@ def number(
 
 def folder_flag(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
     """The flag ``-o`` for the folder of the results."""
-    about = "keeps cells, fits and tables; what is there is used, and an interrupted bench goes on"
+    about = "keeps records, fits and tables; what is there is used, and an interrupted bench goes on"
     parser.add_argument("-o", "--out", type=Path, metavar="DIR", required=required, help=about)
 
 

@@ -20,7 +20,7 @@ Name = TypeVar("Name", bound=str)
 def _paper_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files, or folders of them")
     parser.add_argument(
-        "-o", "--out", required=True, type=Path, metavar="DIR", help="keeps cells and tables; what is there is used"
+        "-o", "--out", required=True, type=Path, metavar="DIR", help="keeps records and tables; what is there is used"
     )
     parser.add_argument(
         "--table",
@@ -34,7 +34,7 @@ def _paper_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--reference", type=Path, metavar="MESH", help="what clouds among the shapes are measured against"
     )
-    parser.add_argument("--jobs", type=whole(1), default=1, metavar="N", help="cells at a time, through Ray (1)")
+    parser.add_argument("--jobs", type=whole(1), default=1, metavar="N", help="jobs at a time, through Ray (1)")
     parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of everything random (0)")
     parser.add_argument("--device", default="auto", help="torch device (auto)")
     parser.add_argument(
@@ -52,7 +52,7 @@ def _paper(arguments: argparse.Namespace) -> int:
     from mplicits.pipelines.training.folder import locked
     from mplicits.pipelines.training.trainer import Interrupted
 
-    from ..harness.cells import make_folder
+    from ..harness.jobs import make_folder
     from ..harness.plots import check_matplotlib
     from ..harness.report import as_text, section_as_dict
     from ..paper.bench import PAGE, Bench, bench_paper, find_shapes
@@ -74,7 +74,7 @@ def _paper(arguments: argparse.Namespace) -> int:
         with locked(arguments.out):
             sections, failures = bench_paper(bench, arguments.out, say=lambda text: print(text, file=sys.stderr))
     except (Interrupted, KeyboardInterrupt):
-        print("interrupted; the same command goes on after the last finished cell", file=sys.stderr)
+        print("interrupted; the same command goes on after the last finished job", file=sys.stderr)
         return 130
     for section in sections:
         for table in section.tables[:1]:
@@ -82,7 +82,7 @@ def _paper(arguments: argparse.Namespace) -> int:
     print(f"all of it, with plots and pictures: {arguments.out / PAGE}")
     write_json(arguments.json, [section_as_dict(section) for section in sections])
     if failures:
-        print(f"{failures} cells failed; the same command tries them again", file=sys.stderr)
+        print(f"{failures} jobs failed; the same command tries them again", file=sys.stderr)
     return 1 if failures else 0
 
 
@@ -114,5 +114,5 @@ PAPER = Command(
     _paper_arguments,
     _paper,
     "Train every method of the paper on the same clouds, measure them in the same way, and write its tables with the "
-    "published figures beside ours. Finished cells are kept: the same command goes on where it was stopped.",
+    "published figures beside ours. Finished jobs are kept: the same command goes on where it was stopped.",
 )

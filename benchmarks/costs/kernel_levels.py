@@ -11,7 +11,7 @@ from mplicits.pipelines.training.trainer import seeded
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part, network_name
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, tabulated
 from .kernels import JET, MANY, POINT, evaluated_by, staged_bytes
 from .rounding import gated_bound, rounding_bound
@@ -82,7 +82,7 @@ class LevelsBench(Benchmark[LevelsRow]):
     points: int = 65
     seed: int = 0
 
-    def cells(self) -> list[Part]:
+    def jobs(self) -> list[Part]:
         """One for each field and taper."""
         return [
             Part(self.name, f"{network_name(sizes)}, taper {taper:g}", options=(("sizes", sizes), ("taper", taper)))
@@ -90,9 +90,9 @@ class LevelsBench(Benchmark[LevelsRow]):
             for taper in TAPERS
         ]
 
-    def measure(self, cell: Part, work: Workplace) -> list[LevelsRow]:
+    def measure(self, job: Part, context: Context) -> list[LevelsRow]:
         """See `Benchmark.measure`."""
-        return [self.compared(**cell.parameters)]
+        return [self.compared(**job.parameters)]
 
     @torch.no_grad()
     def compared(self, sizes: Sequence[tuple[int, int]], taper: float) -> LevelsRow:

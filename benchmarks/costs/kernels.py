@@ -18,7 +18,7 @@ from mplicits.pipelines.training.trainer import seeded
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part, network_name
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, tabulated
 from .rounding import rounding_bound
 from .traffic import traffic_of
@@ -85,15 +85,15 @@ class KernelsBench(Benchmark[KernelRow]):
     points: int = 65
     seed: int = 0
 
-    def cells(self) -> list[Part]:
+    def jobs(self) -> list[Part]:
         """One for each network; raises `InputError` where the kernels cannot run."""
         if reason := choose(torch.empty(0, 3, device=self.device), width=16, depth=1).reason:
             raise InputError(f"the fused kernels cannot run here: {reason}")
         return [Part(self.name, network_name([s]), options=(("width", s[0]), ("depth", s[1]))) for s in self.sizes]
 
-    def measure(self, cell: Part, work: Workplace) -> list[KernelRow]:
+    def measure(self, job: Part, context: Context) -> list[KernelRow]:
         """See `Benchmark.measure`."""
-        return [self.compared(**cell.parameters)]
+        return [self.compared(**job.parameters)]
 
     @torch.no_grad()
     def compared(self, width: int, depth: int) -> KernelRow:

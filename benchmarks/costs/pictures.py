@@ -18,7 +18,7 @@ from mplicits.pipelines.render.trace import Seen, pixel_size, trace_view
 from mplicits.pipelines.training.trainer import seeded
 
 from ..harness.benchmark import Benchmark, Part
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, tabulated
 
 EYE, FOV = (1.6, 0.9, 2.0), 40.0
@@ -93,7 +93,7 @@ class PicturesBench(Benchmark[PictureRow]):
     sizes: tuple[tuple[int, int], ...] = ((512, 512), (1920, 1080))
     repeats: int = 30
 
-    def cells(self) -> list[Part]:
+    def jobs(self) -> list[Part]:
         """One for each size and level."""
         levels = sorted({0, self._field("cpu").num_levels - 1})
         return [
@@ -102,9 +102,9 @@ class PicturesBench(Benchmark[PictureRow]):
             for level in levels
         ]
 
-    def measure(self, cell: Part, work: Workplace) -> list[PictureRow]:
+    def measure(self, job: Part, context: Context) -> list[PictureRow]:
         """See `Benchmark.measure`."""
-        return [self.timed(**cell.parameters)]
+        return [self.timed(**job.parameters)]
 
     def timed(self, width: int, height: int, level: int) -> PictureRow:
         """The row of one size and level."""
@@ -167,13 +167,13 @@ class SamplesBench(Benchmark[SampleRow]):
     points: int = 1 << 20
     repeats: int = 10
 
-    def cells(self) -> list[Part]:
+    def jobs(self) -> list[Part]:
         """One for each network."""
         return [Part(self.name, f"({w},{d})", options=(("width", w), ("depth", d))) for w, d in self.sizes]
 
-    def measure(self, cell: Part, work: Workplace) -> list[SampleRow]:
+    def measure(self, job: Part, context: Context) -> list[SampleRow]:
         """See `Benchmark.measure`."""
-        return [self.timed(**cell.parameters)]
+        return [self.timed(**job.parameters)]
 
     @torch.no_grad()
     def timed(self, width: int, depth: int) -> SampleRow:

@@ -20,7 +20,7 @@ from mplicits.pipelines.training.trainer import parameter_count
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, ratio, tabulated
 from ..shapes.fits import fit_home, kept_fit
 from .render_truth import Agreement, Truth
@@ -119,17 +119,17 @@ class RenderBench(Benchmark[RenderRow]):
     naive: bool = True
     networks: Networks = field(default_factory=lambda: NETWORKS)
 
-    def cells(self) -> list[Part]:
-        """One for each shape; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One for each shape; see `Benchmark.jobs`."""
         for shape in self.shapes:
             read_cloud(shape)
         return [Part(self.name, Path(shape).stem, (Path(shape),)) for shape in self.shapes]
 
-    def measure(self, cell: Part, work: Workplace) -> list[RenderRow]:
+    def measure(self, job: Part, context: Context) -> list[RenderRow]:
         """See `Benchmark.measure`; raises `InputError` where a fit has no surface."""
-        (shape,) = cell.files
-        fields = {name: one.to(self.device).requires_grad_(False) for name, one in self.fits(shape, work).items()}
-        truth = Truth(fields, resolution=self.mesh_resolution, device=self.device, report=work.say)
+        (shape,) = job.files
+        fields = {name: one.to(self.device).requires_grad_(False) for name, one in self.fits(shape, context).items()}
+        truth = Truth(fields, resolution=self.mesh_resolution, device=self.device, report=context.say)
         corners, side = truth.outline("128x2_256x2_400x2"), self.size
         cameras = [
             orbit(corners, azimuth=30 + 360 * view / self.views, width=side, height=side) for view in range(self.views)
@@ -140,7 +140,7 @@ class RenderBench(Benchmark[RenderRow]):
             seen, repeats = (cameras[:1], 1) if mode == "naive" else (cameras, self.repeats)
             found: list[RenderRow] = []
             for model in models:
-                work.say(f"{shape.stem}: {model.name}, {mode}")
+                context.say(f"{shape.stem}: {model.name}, {mode}")
                 row = _time(fields[model.network], model, mode, seen, truth, repeats, self.device)
                 base = found[0].seconds if found else row.seconds
                 paper = None if mode == "naive" else row.paper_speedup
@@ -148,7 +148,7 @@ class RenderBench(Benchmark[RenderRow]):
             rows += found
         return rows
 
-    def fits(self, shape: Path, work: Workplace) -> dict[str, Field]:
+    def fits(self, shape: Path, context: Context) -> dict[str, Field]:
         """The networks fitted to a shape, those that are there already taken as they are."""
         fields, cloud = {}, read_cloud(shape)
         for name, levels in self.networks.items():
@@ -156,7 +156,7 @@ class RenderBench(Benchmark[RenderRow]):
             config = replace(
                 self.config, widths=widths, depths=depths, omegas=omegas, steps=steps, learning_rates=rates, levels=None
             )
-            home, told = fit_home(work.out, shape, config), work.stage(f"{shape.stem} {name}")
+            home, told = fit_home(context.out, shape, config), context.stage(f"{shape.stem} {name}")
             fields[name] = kept_fit(home, cloud, config, progress=told).field
         return fields
 

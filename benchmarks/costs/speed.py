@@ -37,7 +37,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, tabulated
 
 SIZES = ((128, 2), (256, 2), (400, 2), (256, 3))
@@ -100,14 +100,14 @@ class NormalsBench(Benchmark[NormalsRow]):
     seed: int = 0
     busy: int = 0
 
-    def cells(self) -> list[Part]:
+    def jobs(self) -> list[Part]:
         """One for each network."""
         return [Part(self.name, f"({w},{d})", options=(("width", w), ("depth", d))) for w, d in self.sizes]
 
-    def measure(self, cell: Part, work: Workplace) -> list[NormalsRow]:
+    def measure(self, job: Part, context: Context) -> list[NormalsRow]:
         """See `Benchmark.measure`."""
         with _busy(self.busy):
-            return [self.timed(**cell.parameters)]
+            return [self.timed(**job.parameters)]
 
     def timed(self, width: int, depth: int) -> NormalsRow:
         """The row of one network."""
@@ -361,8 +361,8 @@ class MeshBench(Benchmark[MeshRow]):
     reference: int = 512
     full: bool = False
 
-    def cells(self) -> list[Part]:
-        """Every row is one; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """Every row is one; see `Benchmark.jobs`."""
         file = find_field(self.run_file)
         peer_mesher()  # it is there, before the long work
         wanted = [(ADAPTIVE, resolution, 1.0) for resolution in sorted({*self.resolutions, self.reference})]
@@ -372,18 +372,18 @@ class MeshBench(Benchmark[MeshRow]):
             for method, cells, share in wanted
         ]
 
-    def measure(self, cell: Part, work: Workplace) -> list[MeshRow]:
+    def measure(self, job: Part, context: Context) -> list[MeshRow]:
         """See `Benchmark.measure`; the paper's scheme is compared with the adaptive mesh of the same resolution."""
-        (file,), (scheme, cells, share) = cell.files, cell.parameters.values()
+        (file,), (scheme, cells, share) = job.files, job.parameters.values()
         if scheme == DENSE:
             return [_alone(_dense, cells, share)]
-        keep = _vertices(work)
+        keep = _vertices(context)
         row = _alone(_adaptive if scheme == ADAPTIVE else _paper, file, cells, keep)
         if scheme == ADAPTIVE:
             return [row]
-        ours = next(one for one in self.cells() if dict(one.options) == {**cell.parameters, "scheme": ADAPTIVE})
-        assert work.first is not None
-        mean, largest = _distances(np.load(_vertices(work.first(ours))), np.load(keep))
+        ours = next(one for one in self.jobs() if dict(one.options) == {**job.parameters, "scheme": ADAPTIVE})
+        assert context.first is not None
+        mean, largest = _distances(np.load(_vertices(context.first(ours))), np.load(keep))
         return [replace(row, mean_distance=mean / _step(cells), max_distance=largest / _step(cells))]
 
     def tables(self, rows: Sequence[MeshRow], *, sgemm: float) -> tuple[Table, ...]:
@@ -416,8 +416,8 @@ class MeshBench(Benchmark[MeshRow]):
         return (tabulated(self.name, "What extraction costs", "method", figures, items, notes=notes),)
 
 
-def _vertices(work: Workplace) -> Path:
-    return work.out / "meshes" / f"{work.key}.npy"
+def _vertices(context: Context) -> Path:
+    return context.out / "meshes" / f"{context.key}.npy"
 
 
 def _alone(work: Callable[..., MeshRow], *arguments: object) -> MeshRow:

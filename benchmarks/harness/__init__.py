@@ -1,1 +1,1 @@
-"""Cells of work that are done once and kept, and the tables, plots and pages made of them."""
+"""Jobs that are done once and kept, and the tables, plots and pages made of them."""

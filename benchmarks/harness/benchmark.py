@@ -1,6 +1,6 @@
 """A benchmark of ours: its options are its fields. All of them run, are kept and are written in this one way.
 
-A folder of results holds ``cells/KEY.json`` for each finished cell, ``runs/NAME-KEY`` for each fit, one CSV per table,
+A folder of results holds ``cells/KEY.json`` for each finished job, ``runs/NAME-KEY`` for each fit, one CSV per table,
 ``results.json`` with all tables and records, and ``results.md``.
 """
 
@@ -21,9 +21,9 @@ from mplicits.neural_fields import InputError
 from mplicits.neural_fields.backend.devices import choose_device, environment, sgemm_rate
 from mplicits.neural_fields.backend.files import write_json, write_whole
 
-from .cells import Catalogue, Findings, Method, Record, Workplace, make_folder
+from .jobs import Context, Method, Record, Registry, Results, make_folder
 from .report import Section, as_csv, as_dict, as_page
-from .run import kept_records, run_cell
+from .run import kept_records, run_job
 from .tables import Table
 
 R = TypeVar("R")
@@ -31,7 +31,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Part:
-    """The work of one cell of a benchmark; see `benchmarks.harness.cells.Cell`.
+    """The work of one job of a benchmark; see `benchmarks.harness.jobs.Job`.
 
     Attributes:
         method: name of the benchmark.
@@ -47,16 +47,16 @@ class Part:
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """See `Cell.inputs`."""
+        """See `Job.inputs`."""
         return self.files
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """See `Cell.parameters`."""
+        """See `Job.parameters`."""
         return dict(self.options)
 
     def as_dict(self) -> dict[str, Any]:
-        """See `Cell.as_dict`."""
+        """See `Job.as_dict`."""
         return {
             "method": self.method,
             "name": self.name,
@@ -75,22 +75,22 @@ class Benchmark(Method[Part], Generic[R]):
     """
 
     row: ClassVar[type[Any]]
-    # Fields that change no figure, or are in the cells.
+    # Fields that change no figure, or are in the jobs.
     apart: ClassVar[tuple[str, ...]] = ()
     differs = ""
     device: str = "cpu"
 
     @abstractmethod
-    def cells(self) -> list[Part]:
-        """What is to be done, one cell for each part that may be kept on its own.
+    def jobs(self) -> list[Part]:
+        """What is to be done, one job for each part that may be kept on its own.
 
         Raises:
             InputError: something cannot be measured; nothing has been done yet.
         """
 
     @abstractmethod
-    def measure(self, cell: Part, work: Workplace) -> list[R]:
-        """The rows of a cell.
+    def measure(self, job: Part, context: Context) -> list[R]:
+        """The rows of a job.
 
         Raises:
             InputError: an option or a file cannot be used.
@@ -101,35 +101,35 @@ class Benchmark(Method[Part], Generic[R]):
         """The figures that people read.
 
         Args:
-            rows: of all cells that are done, one at least.
+            rows: of all jobs that are done, one at least.
             sgemm: the machine's matrix rate in FLOP/s, the limit of every network.
         """
 
-    def settings(self, cell: Part) -> Mapping[str, Any]:
+    def settings(self, job: Part) -> Mapping[str, Any]:
         """All options, and the machine: times are its own."""
         options = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in self.apart}
         where = environment(choose_device(self.device))
         options |= {"device": where["device"], "threads": where["threads"]}
         return json.loads(json.dumps(options, default=plain))
 
-    def run(self, cell: Part, work: Workplace) -> Findings:
+    def run(self, job: Part, context: Context) -> Results:
         """See `Method.run`: one output per row."""
-        return Findings(tuple(_figures(row) for row in self.measure(cell, work)))
+        return Results(tuple(_figures(row) for row in self.measure(job, context)))
 
     def read(self, records: Sequence[Record]) -> list[R]:
         """The rows in records."""
         return [from_figures(self.row, output) for record in records for output in record["outputs"]]
 
     def rows(self, out: Path, **heard: Any) -> list[R]:
-        """The rows of all cells, from results on disk where they exist; raises what a cell raises.
+        """The rows of all jobs, from results on disk where they exist; raises what a job raises.
 
         Args:
             out: folder of the results.
-            heard: ``progress`` and ``say`` of `run_cell`.
+            heard: ``progress`` and ``say`` of `run_job`.
         """
-        cells = self.cells()
+        jobs = self.jobs()
         make_folder(out)
-        return self.read([run_cell(cell, out, Catalogue([self]), device=self.device, **heard) for cell in cells])
+        return self.read([run_job(job, out, Registry([self]), device=self.device, **heard) for job in jobs])
 
 
 def plain(value: Any) -> Any:
@@ -190,7 +190,7 @@ def write_results(
     """Write the tables of all that is done in a folder, as CSV, JSON and Markdown.
 
     Args:
-        planned: the benchmarks, each with its cells.
+        planned: the benchmarks, each with its jobs.
         out: the folder.
         command: as it will stand on the page.
 
@@ -201,8 +201,8 @@ def write_results(
     rate = sgemm_rate(256, device=device)
     machine = machine_words(device, rate)
     sections, records = [], []
-    for bench, cells in planned:
-        done = list(kept_records(cells, out, Catalogue([bench])).values())
+    for bench, jobs in planned:
+        done = list(kept_records(jobs, out, Registry([bench])).values())
         if done:
             sections.append(Section(bench.name, "", bench.source, bench.tables(bench.read(done), sgemm=rate)))
             records += done

@@ -27,7 +27,7 @@ class Section:
         plots: files, relative to the page, with their titles.
         sheets: contact sheets, likewise.
         methods: name, source and what differs, of every method behind the figures.
-        failures: cells that failed or were left out, one line each.
+        failures: jobs that failed or were left out, one line each.
     """
 
     name: str

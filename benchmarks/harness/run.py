@@ -1,4 +1,4 @@
-"""Running a bench: which cells there are, doing those that are not done, and saying how far it is."""
+"""Running a bench: which jobs there are, doing those that are not done, and saying how far it is."""
 
 from __future__ import annotations
 
@@ -15,52 +15,52 @@ from mplicits.neural_fields.backend.devices import choose_device, environment
 from mplicits.pipelines.training.jobs import Outcome, check_jobs, run_jobs, run_streams
 from mplicits.pipelines.training.trainer import Interrupted, Report
 
-from .cells import Catalogue, Cell, Record, Workplace, read_record, write_record
+from .jobs import Context, Job, Record, Registry, read_record, write_record
 
 Say = Callable[[str], None]
-C = TypeVar("C", bound=Cell)
+C = TypeVar("C", bound=Job)
 
 
-def run_cell(
-    cell: C,
+def run_job(
+    job: C,
     out: Path,
-    catalogue: Catalogue[C],
+    registry: Registry[C],
     *,
     device: str = "cpu",
     progress: Report | None = None,
     say: Say = lambda _: None,
 ) -> Record:
-    """Do the work of a cell and keep its record; a cell that has one is not run again.
+    """Run a job and keep its record; a job that has one is not run again.
 
     Args:
-        cell: what to do.
+        job: what to do.
         out: folder of the bench (see `make_folder`).
-        catalogue: the methods.
+        registry: the methods.
         device: a torch device.
         progress: called now and then with how far the training is.
         say: told what comes next.
 
     Returns:
-        What the cell is, its method, and what it found: "outputs", "deltas" and "details" of `Findings`.
+        The record: the job, its method, and "outputs", "deltas" and "details" of `Results`.
 
     Raises:
-        InputError: what the cell is about cannot be read or used. Whatever a method raises is kept as the record's
-            "error", and such a cell is run again next time.
+        InputError: what the job is about cannot be read or used. Whatever a method raises is kept as the record's
+            "error", and such a job is run again next time.
         Interrupted: Ctrl-C during a fit of ours, which goes on there next time.
     """
-    method, key = catalogue.named(cell.method), catalogue.key(cell)
+    method, key = registry.named(job.method), registry.key(job)
     found = read_record(out, key)
     if found is not None:
         return found
-    head = {"cell": cell.as_dict(), "method": {"source": method.source, "differs": method.differs}}
+    head = {"cell": job.as_dict(), "method": {"source": method.source, "differs": method.differs}}
 
-    def first(other: C) -> Workplace:
-        run_cell(other, out, catalogue, device=device, progress=progress, say=say)
-        return Workplace(out, catalogue.key(other), device, progress, say, first)
+    def first(other: C) -> Context:
+        run_job(other, out, registry, device=device, progress=progress, say=say)
+        return Context(out, registry.key(other), device, progress, say, first)
 
     started = time.perf_counter()
     try:
-        findings = method.run(cell, Workplace(out, key, device, progress, say, first))
+        results = method.run(job, Context(out, key, device, progress, say, first))
     except Interrupted:
         raise
     except Exception as error:
@@ -68,9 +68,9 @@ def run_cell(
         raise
     record = head | {
         "key": key,
-        "outputs": [dict(output) for output in findings.outputs],
-        "deltas": list(findings.deltas),
-        "details": dict(findings.details),
+        "outputs": [dict(output) for output in results.outputs],
+        "deltas": list(results.deltas),
+        "details": dict(results.details),
         "seconds": round(time.perf_counter() - started, 3),
         "environment": environment(choose_device(device)),
     }
@@ -80,7 +80,7 @@ def run_cell(
 
 @dataclass(frozen=True)
 class Ran(Generic[C]):
-    """What became of the cells.
+    """What became of the jobs.
 
     Attributes:
         records: of those that are done.
@@ -93,12 +93,12 @@ class Ran(Generic[C]):
     lacking: Mapping[str, str]
 
 
-def run_cells(
-    cells: Sequence[C],
+def run_pending(
+    jobs: Sequence[C],
     out: Path,
-    catalogue: Catalogue[C],
+    registry: Registry[C],
     *,
-    jobs: int = 1,
+    workers: int = 1,
     streams: int = 1,
     device: str = "cpu",
     say: Say,
@@ -108,59 +108,59 @@ def run_cells(
     """Run what has no record yet, one line each.
 
     Args:
-        cells: each once.
+        jobs: each once.
         out: folder of the bench.
-        catalogue: the methods.
-        jobs: how many at a time, in processes (see `run_jobs`).
-        streams: how many at a time in this process, on one GPU (see `run_streams`); with one job only.
+        registry: the methods.
+        workers: jobs at a time, in processes (see `run_jobs`).
+        streams: how many at a time in this process, on one GPU (see `run_streams`); with one worker only.
         device: a torch device, or "auto".
-        say: told one line per cell.
+        say: told one line per job.
         progress: called now and then with how far a training is; with one at a time only.
-        tell: told what comes next in a cell; with one at a time only.
+        tell: told what comes next in a job; with one at a time only.
 
     Raises:
-        InputError: no such device, or no Ray for more than one job.
-        KeyboardInterrupt: Ctrl-C; finished cells are kept.
+        InputError: no such device, or no Ray for more than one worker.
+        KeyboardInterrupt: Ctrl-C; finished jobs are kept.
         Interrupted: the same, during a fit of ours.
     """
     where = str(choose_device(device))
-    check_jobs(jobs)
-    methods = {cell: catalogue.named(cell.method) for cell in cells}
+    check_jobs(workers)
+    methods = {job: registry.named(job.method) for job in jobs}
     lacking = {method.name: why for method in methods.values() if (why := method.missing()) is not None}
     for name, why in lacking.items():
         say(f"left out: {name}, {why}")
-    possible = [cell for cell in cells if cell.method not in lacking]
-    records = dict(kept_records(possible, out, catalogue))
-    waiting = [cell for cell in possible if cell not in records]
+    possible = [job for job in jobs if job.method not in lacking]
+    records = dict(kept_records(possible, out, registry))
+    waiting = [job for job in possible if job not in records]
     if records and waiting:
-        say(f"{len(records)} of {len(possible)} cells are there already")
-    counter = _Counter(len(waiting), say, at_once=max(jobs, streams))
-    heard = {"progress": progress, "say": tell} if jobs == streams == 1 else {}
-    work = functools.partial(run_cell, out=out, catalogue=catalogue, device=where, **heard)
+        say(f"{len(records)} of {len(possible)} jobs are there already")
+    counter = _Counter(len(waiting), say, at_once=max(workers, streams))
+    heard = {"progress": progress, "say": tell} if workers == streams == 1 else {}
+    work = functools.partial(run_job, out=out, registry=registry, device=where, **heard)
     failures: dict[C, str] = {}
     # What others go on from comes first, so that it is not trained twice side by side.
     for depends in (False, True):
-        group = [cell for cell in waiting if methods[cell].goes_on(cell) is depends]
+        group = [job for job in waiting if methods[job].goes_on(job) is depends]
         if streams > 1:
             outcomes = run_streams(work, group, streams=streams, device=torch.device(where), report=counter)
         else:
-            outcomes = run_jobs(work, group, jobs=jobs, report=counter)
+            outcomes = run_jobs(work, group, jobs=workers, report=counter)
         for outcome in outcomes:
             if outcome.value is None:
                 failures[outcome.item] = outcome.error or "failed"
             else:
                 records[outcome.item] = outcome.value
-    return Ran({cell: records[cell] for cell in cells if cell in records}, failures, lacking)
+    return Ran({job: records[job] for job in jobs if job in records}, failures, lacking)
 
 
-def kept_records(cells: Sequence[C], out: Path, catalogue: Catalogue[C]) -> Mapping[C, Record]:
-    """The records of those cells that are done."""
-    found = {cell: read_record(out, catalogue.key(cell)) for cell in cells}
-    return {cell: record for cell, record in found.items() if record is not None}
+def kept_records(jobs: Sequence[C], out: Path, registry: Registry[C]) -> Mapping[C, Record]:
+    """The records of those jobs that are done."""
+    found = {job: read_record(out, registry.key(job)) for job in jobs}
+    return {job: record for job, record in found.items() if record is not None}
 
 
 class _Counter:
-    """One line per finished cell, with the time left at the mean pace so far: those under way count as half done."""
+    """One line per finished job, with the time left at the mean pace so far: those under way count as half done."""
 
     def __init__(self, total: int, say: Say, *, at_once: int = 1) -> None:
         self.total, self.say, self.at_once = total, say, at_once

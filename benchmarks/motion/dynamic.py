@@ -18,7 +18,7 @@ from mplicits.pipelines.training.folder import find_field
 
 from ..costs.speed import counted, evaluate_slabs, peer_mesher
 from ..harness.benchmark import Benchmark, Part
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, tabulated
 from .evolve import MorphBench
 
@@ -80,8 +80,8 @@ class DynamicBench(Benchmark[DynamicRow]):
     resolution: int = 256
     frames: int = 14
 
-    def cells(self) -> list[Part]:
-        """One; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One; see `Benchmark.jobs`."""
         peer_mesher()  # it is there, before the long work
         if self.morph is not None:
             return [Part(self.name, "the morph, traced", tuple(map(Path, self.morph.meshes)))]
@@ -91,14 +91,14 @@ class DynamicBench(Benchmark[DynamicRow]):
             raise InputError(f"--trace {self.run_file}: does not move; give a run of `mplicits evolve`")
         return [Part(self.name, f"{file.parent.name}, traced", (file,))]
 
-    def measure(self, cell: Part, work: Workplace) -> list[DynamicRow]:
+    def measure(self, job: Part, context: Context) -> list[DynamicRow]:
         """See `Benchmark.measure`."""
         if self.morph is None:
-            (file,) = cell.files
+            (file,) = job.files
         else:
-            assert work.first is not None
-            (morph,) = self.morph.cells()
-            file = find_field(work.first(morph).run())
+            assert context.first is not None
+            (morph,) = self.morph.jobs()
+            file = find_field(context.first(morph).run())
         return dynamic_rows(load_field(file).field, frames=self.frames, size=self.size, cells=self.resolution)
 
     def tables(self, rows: Sequence[DynamicRow], *, sgemm: float) -> tuple[Table, ...]:

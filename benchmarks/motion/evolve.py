@@ -35,7 +35,7 @@ from mplicits.pipelines.training.settings import EvolveConfig, FitConfig
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, tabulated
 from ..shapes.fits import fit_home, kept_fit
 
@@ -152,15 +152,15 @@ class ExactBench(Benchmark[ExactRow]):
     config: EvolveConfig
     cases: Sequence[str] = tuple(CASES)
 
-    def cells(self) -> list[Part]:
-        """One for each case; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One for each case; see `Benchmark.jobs`."""
         return [Part(self.name, case, options=(("case", case),)) for case in self.cases]
 
-    def measure(self, cell: Part, work: Workplace) -> list[ExactRow]:
+    def measure(self, job: Part, context: Context) -> list[ExactRow]:
         """See `Benchmark.measure`."""
-        case = CASES[cell.name]
-        run = evolve(dataclasses.replace(self.config, **case.settings), progress=work.stage(cell.name))
-        return [measure_exact(cell.name, run.field, case, run.record["training_seconds"])]
+        case = CASES[job.name]
+        run = evolve(dataclasses.replace(self.config, **case.settings), progress=context.stage(job.name))
+        return [measure_exact(job.name, run.field, case, run.record["training_seconds"])]
 
     def tables(self, rows: Sequence[ExactRow], *, sgemm: float) -> tuple[Table, ...]:
         """See `Benchmark.tables`."""
@@ -285,8 +285,8 @@ class MorphBench(Benchmark[MorphRow]):
     resolution: int = 256
     samples: int = 500_000
 
-    def cells(self) -> list[Part]:
-        """One; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One; see `Benchmark.jobs`."""
         first, second = paths = [Path(mesh) for mesh in self.meshes]
         if first.stem == second.stem:
             raise InputError(f"--meshes {first} {second}: both are called {first.stem}; rename one")
@@ -294,17 +294,17 @@ class MorphBench(Benchmark[MorphRow]):
             read_reference(path)
         return [Part(self.name, f"{first.stem} to {second.stem}", (first, second))]
 
-    def measure(self, cell: Part, work: Workplace) -> list[MorphRow]:
-        """See `Benchmark.measure`; the morph is left in the run directory of the cell."""
+    def measure(self, job: Part, context: Context) -> list[MorphRow]:
+        """See `Benchmark.measure`; the morph is left in the run directory of the job."""
         runs = []
-        for path in cell.files:
-            home, told = fit_home(work.out, path, self.fits), work.stage(path.stem)
+        for path in job.files:
+            home, told = fit_home(context.out, path, self.fits), context.stage(path.stem)
             kept_fit(home, path, self.fits, progress=told)
             runs.append(home)
         own = dataclasses.replace(self.config, kind="morph", shapes=tuple(map(str, runs)), times=())
-        run = evolve(own, out=work.run(), progress=work.stage("morph"))
+        run = evolve(own, out=context.run(), progress=context.stage("morph"))
         fits, ends, floors = [], [], []
-        for time, (path, directory) in enumerate(zip(cell.files, runs, strict=True)):
+        for time, (path, directory) in enumerate(zip(job.files, runs, strict=True)):
             fitted, similarity, _ = load_field(find_field(directory))
             moved = read_reference(path).moved(similarity)
             back = Placement.from_dict(run.record["placements"][time]).inverse()
@@ -316,7 +316,7 @@ class MorphBench(Benchmark[MorphRow]):
                 floor = metrics.chamfer_floor
             floors.append(floor)
         frames = run.record["checks"]["frames"]
-        first, second = cell.files
+        first, second = job.files
         return [
             MorphRow(
                 (first.stem, second.stem),

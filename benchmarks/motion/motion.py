@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, mean, tabulated
 from ..shapes.fits import fit_home, kept_fit
 from .figures import DeformingField, bending_arm, twisting_bar
@@ -124,8 +124,8 @@ class MotionBench(Benchmark[MotionRow]):
     moments: int = 20
     resolution: int = 96
 
-    def cells(self) -> list[Part]:
-        """One for each figure and method; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One for each figure and method; see `Benchmark.jobs`."""
         for name in self.figures:
             if name not in FIGURES:
                 raise InputError(f"figures: no figure is called {name}; there are {', '.join(FIGURES)}")
@@ -142,12 +142,12 @@ class MotionBench(Benchmark[MotionRow]):
         meets = np.abs(middles[:, None] - keys).min(axis=1) < 0.01 / self.moments
         return tuple((middles + meets * 0.1 / self.moments).tolist())
 
-    def measure(self, cell: Part, work: Workplace) -> list[MotionRow]:
+    def measure(self, job: Part, context: Context) -> list[MotionRow]:
         """See `Benchmark.measure`."""
-        name, method = cell.parameters["figure"], cell.parameters["method"]
+        name, method = job.parameters["figure"], job.parameters["method"]
         truth = FIGURES[name]()
         keys = tuple(np.linspace(0, 1, self.keys).tolist())
-        shapes = self._key_shapes(truth, name, keys, work)
+        shapes = self._key_shapes(truth, name, keys, context)
         if method == BLEND:
             blend, place = blended(shapes, keys)
             return [
@@ -158,7 +158,7 @@ class MotionBench(Benchmark[MotionRow]):
         own = dataclasses.replace(
             self.config, kind=method, shapes=tuple(shape.name for shape in shapes), times=keys, align="none"
         )
-        told, begun = work.stage(cell.name), process_time()
+        told, begun = context.stage(job.name), process_time()
         problem = build_problem(shapes, own)
         run = train_evolution(problem, own, shapes=shapes, progress=told)
         seconds = process_time() - begun
@@ -178,7 +178,7 @@ class MotionBench(Benchmark[MotionRow]):
         return "exact key shapes" if self.noise is None else f"key scans with noise of {100 * self.noise:g} %"
 
     def _key_shapes(
-        self, truth: DeformingField, name: str, keys: Sequence[float], work: Workplace
+        self, truth: DeformingField, name: str, keys: Sequence[float], context: Context
     ) -> list[StaticShape]:
         """The exact shapes, or fits of their scans, which are kept with the results."""
         if self.noise is None:
@@ -187,12 +187,12 @@ class MotionBench(Benchmark[MotionRow]):
         shapes = []
         for index, time in enumerate(keys):
             stem = f"{name.replace(' ', '-')}-{self.noise:g}-{time:.4f}"
-            path = work.out / "scans" / f"{stem}.ply"
+            path = context.out / "scans" / f"{stem}.ply"
             path.parent.mkdir(parents=True, exist_ok=True)
             scan = simulate_scan(TimeSlice(truth, time), resolution=SCAN_RESOLUTION, noise=deviation, seed=index)
             write_cloud_ply(path, scan)
-            home = fit_home(work.out, path, self.fits)
-            kept_fit(home, path, self.fits, progress=work.stage(stem))
+            home = fit_home(context.out, path, self.fits)
+            kept_fit(home, path, self.fits, progress=context.stage(stem))
             shapes.append(read_shape(str(home)))
         return shapes
 

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, mean, tabulated
 from ..shapes.fits import fit_home, kept_fit
 from .motion import BLEND, STRETCHED, blended, carried_points, triangle_stretch
@@ -113,8 +113,8 @@ class PairBench(Benchmark[PairRow]):
     resolution: int = 96
     pictures: Path | None = None
 
-    def cells(self) -> list[Part]:
-        """One for each pair and method; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One for each pair and method; see `Benchmark.jobs`."""
         for pair in self.pairs:
             for path in pair:
                 read_reference(path)
@@ -124,15 +124,15 @@ class PairBench(Benchmark[PairRow]):
             for method in (BLEND, *self.kinds)
         ]
 
-    def measure(self, cell: Part, work: Workplace) -> list[PairRow]:
+    def measure(self, job: Part, context: Context) -> list[PairRow]:
         """See `Benchmark.measure`."""
         homes = []
-        for path in cell.files:
-            home = fit_home(work.out, path, self.fits)
-            kept_fit(home, path, self.fits, progress=work.stage(path.stem))
+        for path in job.files:
+            home = fit_home(context.out, path, self.fits)
+            kept_fit(home, path, self.fits, progress=context.stage(path.stem))
             homes.append(str(home))
-        shapes, method = [read_shape(home) for home in homes], cell.parameters["method"]
-        told, begun = work.stage(cell.name), process_time()
+        shapes, method = [read_shape(home) for home in homes], job.parameters["method"]
+        told, begun = context.stage(job.name), process_time()
         if method == BLEND:
             field, _ = blended(shapes, (0.0, 1.0), self.config.align)
             motion, seconds = None, 0.0
@@ -144,9 +144,9 @@ class PairBench(Benchmark[PairRow]):
         sheet = None
         if self.pictures is not None:
             self.pictures.mkdir(parents=True, exist_ok=True)
-            sheet = self.pictures / f"{'-'.join(path.stem for path in cell.files)}-{method.replace(' ', '-')}.png"
+            sheet = self.pictures / f"{'-'.join(path.stem for path in job.files)}-{method.replace(' ', '-')}.png"
         times = tuple(np.linspace(0, 1, self.moments).tolist())
-        pair = cell.name.rpartition(", ")[0]
+        pair = job.name.rpartition(", ")[0]
         row = measure_pair(pair, method, field, times, velocity=motion, resolution=self.resolution, sheet=sheet)
         return [dataclasses.replace(row, seconds=seconds)]
 

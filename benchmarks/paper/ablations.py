@@ -1,7 +1,7 @@
 """The tables loss-weights and delta-factor: one level of our fit trained again with other weights, or another band.
 
 The error is the paper's "approximation error": the mean of |f(x) − d(x)| near the surface, with the exact signed
-distance d to the mesh. Every cell starts from the levels of one finished fit; only what it is about is trained again.
+distance d to the mesh. Every job starts from the levels of one finished fit; only what it is about is trained again.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from mplicits.pipelines.surface.distance import Float64, MeshDistance
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Report
 
-from ..harness.cells import Findings, Method, Record, Workplace
+from ..harness.jobs import Context, Method, Record, Results
 from ..harness.plots import Plot, Series
 from ..harness.tables import Column, Row, Table, Value, mean
 from ..shapes.sampled_error import approximation_error, near_surface
-from .base import base_cell, base_of, delta_after, generator_for, train_level, up_to
-from .cells import PaperCell, TableSpec, select, shapes_of
+from .base import base_job, base_of, delta_after, generator_for, train_level, up_to
+from .jobs import PaperJob, TableSpec, select, shapes_of
 from .judge import reference_of
 from .ours import Ours, our_config
 from .published import ABL_DELTA, ABL_GRAD, ABL_NORMAL, ABL_SDF
 
 if TYPE_CHECKING:
-    from .cells import Preset
+    from .jobs import Preset
 
 
 class Constraint(NamedTuple):
@@ -63,7 +63,7 @@ LEVELS = ("medium", "fine")
 SHORT_STEPS, SHORT_BATCH = 120, 4096
 
 
-class LossWeights(Method[PaperCell]):
+class LossWeights(Method[PaperJob]):
     """One constraint's weight at one level, the others as they are; ``overrides``: constraint, level."""
 
     name = "loss-weights"
@@ -73,31 +73,31 @@ class LossWeights(Method[PaperCell]):
         "normals by their cosine; the weights not varied are ours, that of the distances relative to the error before"
     )
 
-    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
+    def settings(self, job: PaperJob) -> Mapping[str, Any]:
         """See `Method.settings`."""
-        return {**_settings(cell), "weights": WEIGHTS[cell.preset]}
+        return {**_settings(job), "weights": WEIGHTS[job.preset]}
 
-    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+    def run(self, job: PaperJob, context: Context) -> Results:
         """See `Method.run`: one output per weight, each with its "weight" and "error"."""
-        choice = dict(cell.overrides)
+        choice = dict(job.overrides)
         constraint, level = choice["constraint"], int(choice["level"])
-        base = base_of(cell, work)
-        config = short(base.config, cell.preset)
-        truth = _Truth(cell, base.similarity)
+        base = base_of(job, context)
+        config = short(base.config, job.preset)
+        truth = _Truth(job, base.similarity)
         index, previous = base.index(), up_to(base.field, level - 1)
         delta = float(base.field.deltas[level - 1])
         outputs = []
-        for weight in WEIGHTS[cell.preset]:
+        for weight in WEIGHTS[job.preset]:
             weights = Weights(**{{"gradient": "eikonal", "normal": "normal", "sdf": "data"}[constraint]: weight})
             field = _next_level(
-                index, previous, delta, config, weights, work.progress, f"{constraint} weight {weight:g}"
+                index, previous, delta, config, weights, context.progress, f"{constraint} weight {weight:g}"
             )
             outputs.append({"name": f"{weight:g}", "weight": weight, "error": truth.error(field)})
         details = {"without": truth.error(previous), "fit": truth.error(up_to(base.field, level))}
-        return Findings(tuple(outputs), deltas=(delta,), details=details)
+        return Results(tuple(outputs), deltas=(delta,), details=details)
 
 
-class DeltaFactor(Method[PaperCell]):
+class DeltaFactor(Method[PaperJob]):
     """Both residual levels in bands of another width; ``overrides``: epsilon, one less than the factor."""
 
     name = "delta-factor"
@@ -105,23 +105,23 @@ class DeltaFactor(Method[PaperCell]):
     source = "paper, supplement, table abl-delta"
     differs = "δ is a robust maximum of |f| over the points (fit's own), not the plain one"
 
-    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
+    def settings(self, job: PaperJob) -> Mapping[str, Any]:
         """See `Method.settings`."""
-        return _settings(cell)
+        return _settings(job)
 
-    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+    def run(self, job: PaperJob, context: Context) -> Results:
         """See `Method.run`: one output per residual level, each with its "error"."""
-        base = base_of(cell, work)
-        config = dataclasses.replace(short(base.config, cell.preset), **dict(cell.overrides))
-        truth, index = _Truth(cell, base.similarity), base.index()
+        base = base_of(job, context)
+        config = dataclasses.replace(short(base.config, job.preset), **dict(job.overrides))
+        truth, index = _Truth(job, base.similarity), base.index()
         field, outputs = up_to(base.field, 0), []
         for name in LEVELS:
             delta = delta_after(index, field, config)
             field = _next_level(
-                index, field, delta, config, Weights(), work.progress, f"δ × {1 + config.epsilon:g}, {name}"
+                index, field, delta, config, Weights(), context.progress, f"δ × {1 + config.epsilon:g}, {name}"
             )
             outputs.append({"name": name, "error": truth.error(field)})
-        return Findings(tuple(outputs), deltas=tuple(field.deltas.tolist()))
+        return Results(tuple(outputs), deltas=tuple(field.deltas.tolist()))
 
 
 def short(config: FitConfig, preset: Preset) -> FitConfig:
@@ -132,10 +132,10 @@ def short(config: FitConfig, preset: Preset) -> FitConfig:
     return dataclasses.replace(config, steps=steps, batch=SHORT_BATCH, samples=100_000)
 
 
-def _settings(cell: PaperCell) -> dict[str, Any]:
-    base = base_cell(cell)
-    level = short(our_config(base), cell.preset)
-    sizes = {"points": POINTS[cell.preset], "reach": REACH, "steps": level.steps, "batch": level.batch}
+def _settings(job: PaperJob) -> dict[str, Any]:
+    base = base_job(job)
+    level = short(our_config(base), job.preset)
+    sizes = {"points": POINTS[job.preset], "reach": REACH, "steps": level.steps, "batch": level.batch}
     return {**Ours().settings(base), **sizes, "samples": level.samples}
 
 
@@ -156,11 +156,11 @@ def _next_level(
 
 
 class _Truth:
-    """Points near the surface of a cell's shape, in the fit's coordinates, and their exact distances."""
+    """Points near the surface of a job's shape, in the fit's coordinates, and their exact distances."""
 
-    def __init__(self, cell: PaperCell, similarity: Similarity) -> None:
-        surface = reference_of(cell).moved(similarity)
-        self.points: Float64 = near_surface(surface, POINTS[cell.preset], reach=REACH, seed=cell.seed)
+    def __init__(self, job: PaperJob, similarity: Similarity) -> None:
+        surface = reference_of(job).moved(similarity)
+        self.points: Float64 = near_surface(surface, POINTS[job.preset], reach=REACH, seed=job.seed)
         self.distances: Float64 = MeshDistance(surface).signed(self.points)
 
     def error(self, field: MultiscaleSDF) -> float:
@@ -168,15 +168,15 @@ class _Truth:
         return approximation_error(field, self.points, self.distances)
 
 
-def loss_weight_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
-    """The fits, and for each shape, constraint and residual level one cell with all weights."""
+def loss_weight_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
+    """The fits, and for each shape, constraint and residual level one job with all weights."""
     varied = [
-        PaperCell(shape, LossWeights.name, preset, overrides=(("constraint", constraint), ("level", level)))
+        PaperJob(shape, LossWeights.name, preset, overrides=(("constraint", constraint), ("level", level)))
         for shape in shapes
         for constraint in CONSTRAINTS
         for level in (1, 2)
     ]
-    return [*(base_cell(PaperCell(shape, LossWeights.name, preset)) for shape in shapes), *varied]
+    return [*(base_job(PaperJob(shape, LossWeights.name, preset)) for shape in shapes), *varied]
 
 
 def loss_weight_tables(records: Sequence[Record]) -> tuple[Table, ...]:
@@ -208,14 +208,14 @@ def loss_weight_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     return tuple(tables)
 
 
-def delta_factor_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
-    """The fits, and one cell for each shape and factor."""
+def delta_factor_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
+    """The fits, and one job for each shape and factor."""
     varied = [
-        PaperCell(shape, DeltaFactor.name, preset, overrides=(("epsilon", round(factor - 1, 6)),))
+        PaperJob(shape, DeltaFactor.name, preset, overrides=(("epsilon", round(factor - 1, 6)),))
         for shape in shapes
         for factor in FACTORS[preset]
     ]
-    return [*(base_cell(PaperCell(shape, DeltaFactor.name, preset)) for shape in shapes), *varied]
+    return [*(base_job(PaperJob(shape, DeltaFactor.name, preset)) for shape in shapes), *varied]
 
 
 def delta_factor_tables(records: Sequence[Record]) -> tuple[Table, ...]:
@@ -283,7 +283,7 @@ LOSS_WEIGHTS = TableSpec(
     "loss-weights",
     "Tabs. abl-grad, abl-normal, abl-sdf",
     "each term of the loss at weights from none to far too much, at the medium and at the fine level",
-    loss_weight_cells,
+    loss_weight_jobs,
     loss_weight_tables,
     lambda records: error_plots(loss_weight_tables(records)),
 )
@@ -291,7 +291,7 @@ DELTA_FACTOR = TableSpec(
     "delta-factor",
     "Tab. abl-delta",
     "narrower and wider bands",
-    delta_factor_cells,
+    delta_factor_jobs,
     delta_factor_tables,
     lambda records: error_plots(delta_factor_tables(records)),
 )

@@ -1,6 +1,6 @@
 """The finished fit that the variants of a table start from, and single levels trained anew from the fit's own pieces.
 
-The fit is a cell of our own method, shared with every other table.
+The fit is a job of our own method, shared with every other table.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from mplicits.pipelines.training.folder import find_field
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Report, Trainer
 
-from ..harness.cells import Workplace
-from .cells import PaperCell
+from ..harness.jobs import Context
+from .jobs import PaperJob
 from .judge import damaged_cloud
 from .ours import Ours, our_config
 
@@ -59,20 +59,20 @@ class Base:
         return CloudDistance(points, normals, noise=self.cloud.noise, guessed=self.cloud.estimated)
 
 
-def base_cell(cell: PaperCell, overrides: tuple[tuple[str, Any], ...] = ()) -> PaperCell:
-    """The cell of our own method on the same cloud, with its own settings or others."""
-    return dataclasses.replace(cell, method=Ours.name, overrides=overrides)
+def base_job(job: PaperJob, overrides: tuple[tuple[str, Any], ...] = ()) -> PaperJob:
+    """The job of our own method on the same cloud, with its own settings or others."""
+    return dataclasses.replace(job, method=Ours.name, overrides=overrides)
 
 
-def base_of(cell: PaperCell, work: Workplace, overrides: tuple[tuple[str, Any], ...] = ()) -> Base:
+def base_of(job: PaperJob, context: Context, overrides: tuple[tuple[str, Any], ...] = ()) -> Base:
     """Load that fit; train it first if there is none.
 
     Raises:
         InputError: the cloud cannot be read or used.
     """
-    wanted = base_cell(cell, overrides)
-    assert work.first is not None
-    saved = load_field(find_field(work.first(wanted).run()), device=work.device)
+    wanted = base_job(job, overrides)
+    assert context.first is not None
+    saved = load_field(find_field(context.first(wanted).run()), device=context.device)
     assert isinstance(saved.field, MultiscaleSDF)
     config = our_config(wanted)
     cloud = reviewed(prepare(damaged_cloud(wanted), config), up_to(saved.field, 0), config)

@@ -1,4 +1,4 @@
-"""Benchmark ``paper``: the clouds it is about, the cells that its tables need, and the page of results."""
+"""Benchmark ``paper``: the clouds it is about, the jobs that its tables need, and the page of results."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from mplicits.neural_fields.backend.files import files_in, write_json, write_who
 from mplicits.pipelines.surface.surface import MESH_SUFFIXES, read_reference, read_surface
 
 from ..harness.benchmark import machine_words
-from ..harness.cells import Record, make_folder
+from ..harness.jobs import Record, make_folder
 from ..harness.plots import to_svg
 from ..harness.report import Section, as_csv, as_page, section_as_dict, section_from_dict, with_missing
-from ..harness.run import Ran, kept_records, run_cells
+from ..harness.run import Ran, kept_records, run_pending
 from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
-from .cells import Input, PaperCell, Preset, TableSpec, cells_of
 from .comparison import BANF_TABLE, COMPARISON_TABLE, NOISE_TABLE, POISSON_TABLE
 from .isolation import ISOLATION
+from .jobs import Input, PaperJob, Preset, TableSpec, jobs_of
 from .judge import protocol_of
-from .methods import CATALOGUE
+from .methods import REGISTRY
 from .names import METHODS, TABLES
 from .robustness import DELTAS_TABLE, OUTLIERS_TABLE, UNDERTRAINED_TABLE
 from .sheets import write_sheets
@@ -61,7 +61,7 @@ class Bench:
         preset: how large and how long.
         methods: those of `names.METHODS` that take part.
         seed: of everything.
-        jobs: cells at a time.
+        jobs: how many at a time.
         device: a torch device, or "auto".
         command: as it will stand on the page.
         page: where else the page is written, its plots and sheets in a folder of that name beside it.
@@ -86,37 +86,37 @@ def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple
     Args:
         bench: the options.
         out: the folder.
-        say: told one line per cell.
+        say: told one line per job.
 
     Returns:
-        The sections of the chosen tables, and how many cells failed.
+        The sections of the chosen tables, and how many jobs failed.
 
     Raises:
-        InputError: the folder cannot be written, or see `run_cells`.
-        KeyboardInterrupt: Ctrl-C; finished cells are kept.
+        InputError: the folder cannot be written, or see `run_pending`.
+        KeyboardInterrupt: Ctrl-C; finished jobs are kept.
         Interrupted: the same, during a fit of ours.
     """
     make_folder(out)
     # Variants of ours, which only ablations train, are not for --methods to choose.
     skipped = [name for name in METHODS if name not in bench.methods]
     plan = {
-        spec: cells_of(spec, bench.shapes, bench.preset, seed=bench.seed) for spec in SPECS if spec.name in bench.tables
+        spec: jobs_of(spec, bench.shapes, bench.preset, seed=bench.seed) for spec in SPECS if spec.name in bench.tables
     }
-    cells = list(dict.fromkeys(cell for wanted in plan.values() for cell in wanted))
-    asked = [cell for cell in cells if cell.method not in skipped]
-    say(f"{len(plan)} tables, {len(bench.shapes)} shapes, {len(asked)} cells")
-    ran = run_cells(asked, out, CATALOGUE, jobs=bench.jobs, device=bench.device, say=say)
+    jobs = list(dict.fromkeys(job for wanted in plan.values() for job in wanted))
+    asked = [job for job in jobs if job.method not in skipped]
+    say(f"{len(plan)} tables, {len(bench.shapes)} shapes, {len(asked)} jobs")
+    ran = run_pending(asked, out, REGISTRY, workers=bench.jobs, device=bench.device, say=say)
     # What other methods found earlier stays in the tables.
-    records = {**kept_records([cell for cell in cells if cell.method in skipped], out, CATALOGUE), **ran.records}
+    records = {**kept_records([job for job in jobs if job.method in skipped], out, REGISTRY), **ran.records}
     sections = [
-        _section(spec, {cell: records[cell] for cell in wanted if cell in records}, wanted, ran, out)
+        _section(spec, {job: records[job] for job in wanted if job in records}, wanted, ran, out)
         for spec, wanted in plan.items()
     ]
     stamp = {"preset": bench.preset, "seed": bench.seed, "shapes": [shape.path.name for shape in bench.shapes]}
     for section, wanted in zip(sections, plan.values(), strict=True):
         for table in section.tables:
             write_whole(out / f"{table.name}.csv", as_csv(table))
-        own = [dict(records[cell]) for cell in wanted if cell in records]
+        own = [dict(records[job]) for job in wanted if job in records]
         pairs = stamp | {"section": section_as_dict(section), "records": own}
         write_json(out / f"{section.name}.json", pairs)
     there = _kept(out, stamp)
@@ -143,24 +143,24 @@ def _copied(section: Section, out: Path, page: Path) -> Section:
 
 
 def _section(
-    spec: TableSpec, own: Mapping[PaperCell, Record], cells: Sequence[PaperCell], ran: Ran[PaperCell], out: Path
+    spec: TableSpec, own: Mapping[PaperJob, Record], jobs: Sequence[PaperJob], ran: Ran[PaperJob], out: Path
 ) -> Section:
     """Tables, plots and sheets of one spec.
 
     Args:
         spec: the table.
-        own: records of those of its cells that are done.
-        cells: all of its cells.
+        own: records of those of its jobs that are done.
+        jobs: all of its jobs.
         ran: why the others are not.
         out: folder of the bench.
     """
     records = list(own.values())
-    failures = {cell.name: ran.failures[cell] for cell in cells if cell in ran.failures}
-    there = {cell.method for cell in own}
-    missing = {name: why for name, why in ran.lacking.items() if name in {cell.method for cell in cells}}
-    for cell in cells:
-        if cell.method not in there and cell in ran.failures:
-            missing.setdefault(cell.method, f"failed, {ran.failures[cell]}")
+    failures = {job.name: ran.failures[job] for job in jobs if job in ran.failures}
+    there = {job.method for job in own}
+    missing = {name: why for name, why in ran.lacking.items() if name in {job.method for job in jobs}}
+    for job in jobs:
+        if job.method not in there and job in ran.failures:
+            missing.setdefault(job.method, f"failed, {ran.failures[job]}")
     tables = spec.tables(records) if records else ()
     if tables:
         tables = (with_missing(tables[0], missing), *tables[1:])

@@ -7,15 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..harness.cells import Record
+from ..harness.jobs import Record
 from ..harness.plots import Plot, Series
 from ..harness.tables import Column, Figure, Row, Table, Value, mean, median, ratio, tabulated
-from .cells import PaperCell, TableSpec, by_shape, figure, of_output, outputs_of, printed_name, select, shapes_of
+from .jobs import PaperJob, TableSpec, by_shape, figure, of_output, outputs_of, printed_name, select, shapes_of
 from .names import METHODS
 from .published import BANF, COMPARISON, NOISE, POISSON
 
 if TYPE_CHECKING:
-    from .cells import Preset
+    from .jobs import Preset
 
 NOISE_LEVEL = 0.01  # of the bounding box's diagonal (paper, Tab. 3)
 CURVE = (0.005, 0.02)  # and what the noise curves have beside it, for these:
@@ -35,36 +35,36 @@ def _methods(names: Iterable[str]) -> list[str]:
     return [name for name in METHODS if name in names]
 
 
-def _comparison_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
+def _comparison_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
     peers = [name for name in METHODS if name not in VARIANTS]
-    return [PaperCell(shape, method, preset) for shape in shapes for method in peers]
+    return [PaperJob(shape, method, preset) for shape in shapes for method in peers]
 
 
-def _noise_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
+def _noise_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
     peers = [name for name in METHODS if name not in VARIANTS]
-    cells = [PaperCell(shape, method, preset, noise=NOISE_LEVEL) for shape in shapes for method in peers]
+    jobs = [PaperJob(shape, method, preset, noise=NOISE_LEVEL) for shape in shapes for method in peers]
     more = [
-        PaperCell(shape, method, preset, noise=noise)
+        PaperJob(shape, method, preset, noise=noise)
         for shape in shapes
         for method in _methods(CURVE_METHODS)
         for noise in (0.0, *CURVE)
     ]
-    return cells + more
+    return jobs + more
 
 
-def _poisson_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
-    cells = [
-        PaperCell(shape, method, preset, noise=noise)
+def _poisson_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
+    jobs = [
+        PaperJob(shape, method, preset, noise=noise)
         for shape in shapes
         for method in ("poisson-trim", "poisson", "ours")
         for noise in (0.0, NOISE_LEVEL)
     ]
-    return cells + [PaperCell(shape, "poisson-smoothed", preset, noise=NOISE_LEVEL) for shape in shapes]
+    return jobs + [PaperJob(shape, "poisson-smoothed", preset, noise=NOISE_LEVEL) for shape in shapes]
 
 
-def _banf_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
+def _banf_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
     return [
-        PaperCell(shape, method, preset, noise=noise)
+        PaperJob(shape, method, preset, noise=noise)
         for shape in shapes
         for method in ("ours", "banf")
         for noise in (0.0, NOISE_LEVEL)
@@ -351,7 +351,7 @@ COMPARISON_TABLE = TableSpec(
     "comparison",
     "t-comparison",
     "every method on clean clouds",
-    _comparison_cells,
+    _comparison_jobs,
     comparison_tables,
     lambda records: _per_mesh_plots("comparison", "clean", records),
     sheets=True,
@@ -360,10 +360,10 @@ NOISE_TABLE = TableSpec(
     "noise",
     "table:noise_comparison",
     "every method on clouds with 1 % noise",
-    _noise_cells,
+    _noise_jobs,
     noise_tables,
     noise_plots,
     sheets=True,
 )
-POISSON_TABLE = TableSpec("poisson", "tab:spsr", "screened Poisson, clean and noisy", _poisson_cells, poisson_tables)
-BANF_TABLE = TableSpec("banf", "tab:banf", "BANF, clean and noisy", _banf_cells, banf_tables)
+POISSON_TABLE = TableSpec("poisson", "tab:spsr", "screened Poisson, clean and noisy", _poisson_jobs, poisson_tables)
+BANF_TABLE = TableSpec("banf", "tab:banf", "BANF, clean and noisy", _banf_jobs, banf_tables)

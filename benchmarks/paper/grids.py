@@ -16,7 +16,7 @@ from mplicits.pipelines.training.trainer import Report, parameter_count, seeded
 from torch import Tensor
 
 from ..peers import BandLimited, BanfSDF, HashGridSDF
-from .cells import Preset
+from .jobs import Preset
 from .recipe import Output, Recipe, SignedPools, cosine, descend, differences, finished, mape_loss, stencil
 
 # Rows per call where a field is evaluated on a whole pool.

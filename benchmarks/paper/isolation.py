@@ -20,11 +20,11 @@ from mplicits.pipelines.fit.samples import banded_sources
 from mplicits.pipelines.training.trainer import Report, parameter_count
 from torch import Tensor, nn
 
-from ..harness.cells import Findings, Method, Record, Workplace
+from ..harness.jobs import Context, Method, Record, Results
 from ..harness.tables import Column, Row, Table, Value, mean, median
 from .base import (
     Base,
-    base_cell,
+    base_job,
     base_of,
     delta_after,
     domain_sources,
@@ -34,13 +34,13 @@ from .base import (
     up_to,
     without_bands,
 )
-from .cells import PaperCell, TableSpec, select, shapes_of
+from .jobs import PaperJob, TableSpec, select, shapes_of
 from .judge import Judge, protocol_of
 from .ours import Ours
 from .published import CD_WITHOUT_CULLING, COMPONENTS, TAB_ISOLATION
 
 if TYPE_CHECKING:
-    from .cells import Preset
+    from .jobs import Preset
 
 NOISE = 0.01
 VARIANTS: Mapping[str, str] = MappingProxyType(
@@ -110,10 +110,10 @@ class IndependentLevels(Field):
         return walk_levels(levels, self.deltas, self.check_points(x), evaluate, lambda _before, own, _delta: own)
 
 
-class Isolation(Method[PaperCell]):
+class Isolation(Method[PaperJob]):
     """One variant of the residual levels, trained on the coarse level of our fit; ``overrides``: variant, a, b or c.
 
-    Variant (a) is the fit itself, so its cell only extracts it once more, with and without culling. No blobs are
+    Variant (a) is the fit itself, so its job only extracts it once more, with and without culling. No blobs are
     removed from any of them, as the fit's own row elsewhere has it, since blobs are what this is about.
     """
 
@@ -122,25 +122,25 @@ class Isolation(Method[PaperCell]):
     source = "paper, supplement, table isolation"
     differs = "the schedule, the weights and the samples are those of our fit"
 
-    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
+    def settings(self, job: PaperJob) -> Mapping[str, Any]:
         """See `Method.settings`."""
-        return Ours().settings(base_cell(cell))
+        return Ours().settings(base_job(job))
 
-    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+    def run(self, job: PaperJob, context: Context) -> Results:
         """See `Method.run`; outputs "a", "b" or "c", and with noise "a without culling" and "c without culling"."""
-        variant = str(dict(cell.overrides)["variant"])
-        base, judge = base_of(cell, work), Judge(cell, work)
-        resolution = protocol_of(cell.preset).resolution
+        variant = str(dict(job.overrides)["variant"])
+        base, judge = base_of(job, context), Judge(job, context)
+        resolution = protocol_of(job.preset).resolution
         started = time.perf_counter()
         if variant == "a":
             field, unculled = base.field, without_bands(base.field)
         elif variant == "b":
-            field, unculled = residuals_everywhere(base, work.progress), None
+            field, unculled = residuals_everywhere(base, context.progress), None
         else:
-            field = distances_in_bands(base, work.progress)
+            field = distances_in_bands(base, context.progress)
             unculled = field.finest()
         surfaces: list[tuple[str, Field, bool, int]] = [(variant, field, variant == "b", resolution)]
-        if unculled is not None and cell.noise:  # as in the paper; it takes longer than all the rest
+        if unculled is not None and job.noise:  # as in the paper; it takes longer than all the rest
             surfaces.append((variant + UNCULLED, unculled, True, resolution // 2))
         seconds = time.perf_counter() - started
         outputs = []
@@ -149,7 +149,7 @@ class Isolation(Method[PaperCell]):
             figures = _figures(judge, base, name, surface, slope, cells, seconds)
             outputs.append({**figures, "lipschitz": slope, "resolution": cells})
         deltas = () if variant == "b" else tuple(field.deltas.tolist())
-        return Findings(tuple(outputs), deltas=deltas)
+        return Results(tuple(outputs), deltas=deltas)
 
 
 def _figures(
@@ -208,15 +208,15 @@ def steepness(field: Field, *, count: int = 1 << 16, margin: float = 1.25, seed:
     return max(LIPSCHITZ, margin * float(slopes.max()))
 
 
-def isolation_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
+def isolation_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
     """The fits and the variants of each shape, clean and with noise."""
-    plain = [PaperCell(shape, Isolation.name, preset, noise=noise) for shape in shapes for noise in (0.0, NOISE)]
+    plain = [PaperJob(shape, Isolation.name, preset, noise=noise) for shape in shapes for noise in (0.0, NOISE)]
     varied = [
-        PaperCell(cell.shape, cell.method, preset, noise=cell.noise, overrides=(("variant", variant),))
-        for cell in plain
+        PaperJob(job.shape, job.method, preset, noise=job.noise, overrides=(("variant", variant),))
+        for job in plain
         for variant in VARIANTS
     ]
-    return [*map(base_cell, plain), *varied]
+    return [*map(base_job, plain), *varied]
 
 
 def isolation_tables(records: Sequence[Record]) -> tuple[Table, ...]:
@@ -279,7 +279,7 @@ ISOLATION = TableSpec(
     "isolation",
     "Tab. isolation",
     "the method without its bands, and without its residuals",
-    isolation_cells,
+    isolation_jobs,
     isolation_tables,
     sheets=True,
 )

@@ -22,8 +22,8 @@ from mplicits.pipelines.surface.measure import evaluate_surfaces
 from mplicits.pipelines.surface.surface import Support, drop_unsupported, read_reference
 from mplicits.pipelines.training.settings import FitConfig, load_config
 
-from ..harness.cells import Workplace
-from .cells import PaperCell, Preset
+from ..harness.jobs import Context
+from .jobs import PaperJob, Preset
 
 # Bound on |∇f| for extracting fields whose slope is not trained to 1: blocks that it culls are safely empty.
 STEEP = 2.0
@@ -31,27 +31,27 @@ STEEP = 2.0
 FIRST_STEPS, MORE_STEPS = 20, 5
 
 
-def reference_of(cell: PaperCell) -> Mesh:
-    """The surface that a cell's results are measured against.
+def reference_of(job: PaperJob) -> Mesh:
+    """The surface that a job's results are measured against.
 
     Raises:
         InputError: it cannot be read, or has no faces.
     """
-    return read_reference(cell.reference or cell.shape, fix="give --reference MESH")
+    return read_reference(job.reference or job.shape, fix="give --reference MESH")
 
 
 class Judge:
-    """Measures the surfaces of one cell against its reference.
+    """Measures the surfaces of one job against its reference.
 
     Raises:
         InputError: see `reference_of`.
     """
 
-    def __init__(self, cell: PaperCell, work: Workplace) -> None:
-        self.work = work
-        self.seed = cell.seed
-        self.reference = reference_of(cell)
-        self.protocol = protocol_of(cell.preset)
+    def __init__(self, job: PaperJob, context: Context) -> None:
+        self.context = context
+        self.seed = job.seed
+        self.reference = reference_of(job)
+        self.protocol = protocol_of(job.preset)
 
     def field(
         self,
@@ -77,7 +77,7 @@ class Judge:
             lipschitz: see `extract_mesh`.
             support: the points of a fit of ours; components that rest on none of them are dropped, and counted.
         """
-        field = field.to(self.work.device)
+        field = field.to(self.context.device)
         started = time.perf_counter()
         try:
             mesh = extract_mesh(field, resolution=self.protocol.resolution, level=level, lipschitz=lipschitz)
@@ -113,11 +113,11 @@ class Judge:
         }
         if mesh is None or not len(mesh.faces):
             return figures
-        write_mesh(self.work.mesh(name), mesh, similarity)
+        write_mesh(self.context.mesh(name), mesh, similarity)
         surface = replace(mesh, vertices=similarity.to_input(mesh.vertices))
         tile = self.protocol.tile
         camera = orbit(self.reference.vertices, width=tile, height=tile)
-        write_picture(self.work.picture(name), picture_of(surface, camera))
+        write_picture(self.context.picture(name), picture_of(surface, camera))
         metrics = evaluate_surfaces(
             surface,
             self.reference,
@@ -132,7 +132,7 @@ class Judge:
         """Of the paper's fixed-step sphere tracing, without normals, of an image that the unit sphere fills."""
         size = self.protocol.image
         corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-        origin, directions = orbit(corners, width=size, height=size).rays(device=self.work.device)
+        origin, directions = orbit(corners, width=size, height=size).rays(device=self.context.device)
         # Levels without bands are alternatives: only the one that is wanted is traced.
         level = field.resolve_level(level)
         traced = [index for index in range(level) if field.deltas[index].isfinite()] + [level]
@@ -165,7 +165,7 @@ class Protocol:
     tile: int = 320
 
     def as_dict(self) -> dict[str, Any]:
-        """What decides a figure; part of every cell's key."""
+        """What decides a figure; part of every job's key."""
         return {name: number for name, number in asdict(self).items() if name != "tile"}
 
     def summary(self) -> str:
@@ -206,21 +206,21 @@ def fit_config(preset: Preset) -> FitConfig:
     return load_config(FitConfig, {"cpu": "fast", "paper": "paper"}[preset], alike)
 
 
-def damaged_cloud(cell: PaperCell) -> PointCloud:
-    """The cloud of a cell's shape, damaged as the cell asks: noise first, then flipped normals, then strays.
+def damaged_cloud(job: PaperJob) -> PointCloud:
+    """The cloud of a job's shape, damaged as the job asks: noise first, then flipped normals, then strays.
 
     Raises:
         InputError: the file cannot be read, or its points have no normals to move along or turn round.
     """
-    cloud = read_cloud(cell.shape)
-    if cloud.normals is None and (cell.noise or cell.flipped):
-        raise InputError(f"{cell.shape}: has no normals for noise and flips; leave out those tables (--table)")
-    if cell.noise:
-        cloud = add_noise(cloud, cell.noise, seed=cell.seed)
-    if cell.flipped:
-        cloud = flip_normals(cloud, cell.flipped, seed=cell.seed)
-    if cell.outliers:
-        cloud = add_outliers(cloud, cell.outliers, seed=cell.seed)
+    cloud = read_cloud(job.shape)
+    if cloud.normals is None and (job.noise or job.flipped):
+        raise InputError(f"{job.shape}: has no normals for noise and flips; leave out those tables (--table)")
+    if job.noise:
+        cloud = add_noise(cloud, job.noise, seed=job.seed)
+    if job.flipped:
+        cloud = flip_normals(cloud, job.flipped, seed=job.seed)
+    if job.outliers:
+        cloud = add_outliers(cloud, job.outliers, seed=job.seed)
     return cloud
 
 
@@ -240,16 +240,16 @@ def flip_normals(cloud: PointCloud, fraction: float, *, seed: int = 0) -> PointC
     return replace(cloud, normals=normals)
 
 
-def oriented_cloud(cell: PaperCell, *, smooth_noise: bool = False) -> OrientedCloud:
+def oriented_cloud(job: PaperJob, *, smooth_noise: bool = False) -> OrientedCloud:
     """What every method but ours learns from: the damaged cloud in the unit sphere, no point judged to be a stray.
 
     Ours reads the same damaged cloud, but what `fit` does to find strays is part of our method, not of the others'.
 
     Args:
-        cell: whose cloud.
+        job: whose cloud.
         smooth_noise: whether noise is smoothed off as in ours, to see what that alone does for another method.
 
     Raises:
         InputError: see `damaged_cloud`.
     """
-    return prepare_cloud(damaged_cloud(cell), isolation=None, smooth_noise=smooth_noise)
+    return prepare_cloud(damaged_cloud(job), isolation=None, smooth_noise=smooth_noise)

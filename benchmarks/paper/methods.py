@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from ..harness.cells import Catalogue, Method
+from ..harness.jobs import Method, Registry
 from .ablations import DeltaFactor, LossWeights
-from .cells import PaperCell
 from .grids import BanfRecipe, InstantNgpRecipe
 from .isolation import Isolation
+from .jobs import PaperJob
 from .judge import protocol_of
 from .networks import BaconRecipe, IdfRecipe, SirenRecipe
 from .ours import FromRecipe, Ours, Poisson
 from .speed import MarchingCubes, Normals
 
 # The first ones are those of `names.METHODS`; a test holds the two together.
-METHODS: tuple[Method[PaperCell], ...] = (
+METHODS: tuple[Method[PaperJob], ...] = (
     Ours(),
     FromRecipe(SirenRecipe()),
     FromRecipe(InstantNgpRecipe("coarse")),
@@ -30,4 +30,4 @@ METHODS: tuple[Method[PaperCell], ...] = (
     MarchingCubes(),
     Normals(),
 )
-CATALOGUE = Catalogue(METHODS, lambda cell: protocol_of(cell.preset).as_dict())
+REGISTRY = Registry(METHODS, lambda job: protocol_of(job.preset).as_dict())

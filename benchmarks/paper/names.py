@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .cells import Preset
+    from .jobs import Preset
 
 PRESETS: tuple[Preset, ...] = ("smoke", "cpu", "paper")
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ..peers import BaconSDF, IdfSDF
 from ..peers.idf import attenuation
-from .cells import Preset
+from .jobs import Preset
 from .recipe import Output, Recipe, cosine, descend, finished
 
 # What a network begins as, and the rate at which it gets there: at 3e-3 nothing is left of a sphere at ω₀ = 30, and

@@ -15,22 +15,22 @@ from mplicits.pipelines.surface.surface import read_support
 from mplicits.pipelines.training.folder import FIELD_FILE
 from mplicits.pipelines.training.settings import FitConfig
 
-from ..harness.cells import Findings, Method, Workplace
+from ..harness.jobs import Context, Method, Results
 from ..shapes.fits import has_poisson, kept_fit, screened_poisson
-from .cells import PaperCell
+from .jobs import PaperJob
 from .judge import Judge, damaged_cloud, fit_config, oriented_cloud, protocol_of
 from .recipe import Recipe
 
 LIPSCHITZ = 1.25  # the eikonal term keeps |∇f| near 1
 
 
-def our_config(cell: PaperCell) -> FitConfig:
-    """The preset's settings with what the cell overrides.
+def our_config(job: PaperJob) -> FitConfig:
+    """The preset's settings with what the job overrides.
 
     Raises:
         ValueError: a setting is out of range.
     """
-    return dataclasses.replace(fit_config(cell.preset), **dict(cell.overrides), seed=cell.seed)
+    return dataclasses.replace(fit_config(job.preset), **dict(job.overrides), seed=job.seed)
 
 
 def level_names(count: int) -> list[str]:
@@ -44,7 +44,7 @@ def level_names(count: int) -> list[str]:
     return [f"Ours {name}" for name in ["coarse", *middle, "fine"][:count]]
 
 
-class Ours(Method[PaperCell]):
+class Ours(Method[PaperJob]):
     """One training; every level is an output, with the time and the parameters up to and with it."""
 
     name = "ours"
@@ -54,16 +54,16 @@ class Ours(Method[PaperCell]):
         "`mplicits fit`, whose finest level is (256, 2), not (400, 2)"
     )
 
-    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
+    def settings(self, job: PaperJob) -> Mapping[str, Any]:
         """All settings of the fit but the device, and those of how a table is read."""
         left_out = ("device", "columns", "drop_noise")
-        return {"fit": {k: v for k, v in dataclasses.asdict(our_config(cell)).items() if k not in left_out}}
+        return {"fit": {k: v for k, v in dataclasses.asdict(our_config(job)).items() if k not in left_out}}
 
-    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+    def run(self, job: PaperJob, context: Context) -> Results:
         """Fit, and measure every level; an interrupted fit goes on, and a finished one is reused."""
-        judge, directory = Judge(cell, work), work.run()
-        config = dataclasses.replace(our_config(cell), device=work.device)
-        run = kept_fit(directory, damaged_cloud(cell), config, progress=work.progress)
+        judge, directory = Judge(job, context), context.run()
+        config = dataclasses.replace(our_config(job), device=context.device)
+        run = kept_fit(directory, damaged_cloud(job), config, progress=context.progress)
         stages = run.record["stages"]
         seconds = accumulate(stage["sampling_seconds"] + stage["training_seconds"] for stage in stages)
         parameters = accumulate(stage["parameters"] for stage in stages)
@@ -83,24 +83,24 @@ class Ours(Method[PaperCell]):
             )
         ]
         details = {"cleaning": run.record["cleaning"], "stages": stages}
-        return Findings(tuple(outputs), tuple(run.record["deltas"]), details)
+        return Results(tuple(outputs), tuple(run.record["deltas"]), details)
 
 
-class FromRecipe(Method[PaperCell]):
-    """A recipe, trained on the cell's cloud, and the figures of each of its outputs."""
+class FromRecipe(Method[PaperJob]):
+    """A recipe, trained on the job's cloud, and the figures of each of its outputs."""
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
         self.name, self.source, self.differs = recipe.name, recipe.source, recipe.differs
 
-    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
-        """Size and schedule at the cell's preset."""
-        return {"recipe": repr(self.recipe.presets[cell.preset])}
+    def settings(self, job: PaperJob) -> Mapping[str, Any]:
+        """Size and schedule at the job's preset."""
+        return {"recipe": repr(self.recipe.presets[job.preset])}
 
-    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+    def run(self, job: PaperJob, context: Context) -> Results:
         """Train, then measure every output."""
-        judge, cloud = Judge(cell, work), oriented_cloud(cell)
-        trained = self.recipe.train(cloud, cell.preset, seed=cell.seed, device=work.device, progress=work.progress)
+        judge, cloud = Judge(job, context), oriented_cloud(job)
+        trained = self.recipe.train(cloud, job.preset, seed=job.seed, device=context.device, progress=context.progress)
         outputs = [
             judge.field(
                 output.name,
@@ -112,10 +112,10 @@ class FromRecipe(Method[PaperCell]):
             )
             for output in trained.outputs
         ]
-        return Findings(tuple(outputs), details={"steps": trained.steps})
+        return Results(tuple(outputs), details={"steps": trained.steps})
 
 
-class Poisson(Method[PaperCell]):
+class Poisson(Method[PaperJob]):
     """Screened Poisson reconstruction.
 
     Args:
@@ -141,12 +141,12 @@ class Poisson(Method[PaperCell]):
         """The extra, where it is not installed."""
         return None if has_poisson() else "needs pip install mplicits[poisson]"
 
-    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+    def run(self, job: PaperJob, context: Context) -> Results:
         """Reconstruct, and measure."""
-        judge, cloud = Judge(cell, work), oriented_cloud(cell, smooth_noise=self.smoothed)
+        judge, cloud = Judge(job, context), oriented_cloud(job, smooth_noise=self.smoothed)
         importlib.import_module("pymeshlab")  # so that loading it is not timed
         started = time.perf_counter()
-        surface = screened_poisson(cloud, depth=protocol_of(cell.preset).poisson_depth, trim=self.trim)
+        surface = screened_poisson(cloud, depth=protocol_of(job.preset).poisson_depth, trim=self.trim)
         seconds = time.perf_counter() - started
         mesh = Mesh(surface.vertices, surface.faces.astype(np.int32))
-        return Findings((judge.mesh(self.label, mesh, cloud.similarity, train_seconds=seconds),))
+        return Results((judge.mesh(self.label, mesh, cloud.similarity, train_seconds=seconds),))

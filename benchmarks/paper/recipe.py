@@ -16,7 +16,7 @@ from mplicits.pipelines.fit.samples import DOMAIN
 from mplicits.pipelines.training.trainer import Group, Objective, Report, Trainer
 from torch import Tensor, nn
 
-from .cells import Preset
+from .jobs import Preset
 
 F = TypeVar("F", bound=Field)
 S = TypeVar("S")

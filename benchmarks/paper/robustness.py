@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..harness.cells import Record
+from ..harness.jobs import Record
 from ..harness.plots import Plot, Series
 from ..harness.tables import Column, Row, Table, Value, ratio
-from .cells import PaperCell, TableSpec, figure, printed_name, select, shapes_of
 from .comparison import NOISE_LEVEL
+from .jobs import PaperJob, TableSpec, figure, printed_name, select, shapes_of
 from .judge import fit_config
 from .published import DELTAS, OUTLIERS, UNDERTRAINED
 
 if TYPE_CHECKING:
-    from .cells import Preset
+    from .jobs import Preset
 
 CONTAMINATION = (0.001, 0.01, 0.05)  # the paper has the first two
 FLIPPED = 0.1
@@ -23,14 +23,14 @@ OUTLIER_METHODS = ("ours", "poisson", "poisson-trim")
 SHARES = (0.25, 0.5, 1.0)
 
 
-def _outlier_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
+def _outlier_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
     strays = [
-        PaperCell(shape, method, preset, outliers=fraction)
+        PaperJob(shape, method, preset, outliers=fraction)
         for shape in shapes
         for fraction in CONTAMINATION
         for method in OUTLIER_METHODS
     ]
-    flipped = [PaperCell(shape, method, preset, flipped=FLIPPED) for shape in shapes for method in ("ours", "poisson")]
+    flipped = [PaperJob(shape, method, preset, flipped=FLIPPED) for shape in shapes for method in ("ours", "poisson")]
     return strays + flipped
 
 
@@ -114,9 +114,9 @@ def shortened(steps: Sequence[int], share: float) -> tuple[tuple[str, Any], ...]
     return () if share == 1 else (("steps", (max(round(share * steps[0]), 1), *steps[1:])),)
 
 
-def _undertrained_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
+def _undertrained_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
     steps = fit_config(preset).steps
-    return [PaperCell(shape, "ours", preset, overrides=shortened(steps, share)) for shape in shapes for share in SHARES]
+    return [PaperJob(shape, "ours", preset, overrides=shortened(steps, share)) for shape in shapes for share in SHARES]
 
 
 def undertrained_tables(records: Sequence[Record]) -> tuple[Table, ...]:
@@ -154,8 +154,8 @@ def _share(record: Record) -> float:
     return min(SHARES, key=lambda share: abs(share - steps[0] / full))
 
 
-def _delta_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
-    return [PaperCell(shape, "ours", preset, noise=noise) for shape in shapes for noise in (0.0, NOISE_LEVEL)]
+def _delta_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
+    return [PaperJob(shape, "ours", preset, noise=noise) for shape in shapes for noise in (0.0, NOISE_LEVEL)]
 
 
 def delta_tables(records: Sequence[Record]) -> tuple[Table, ...]:
@@ -186,12 +186,12 @@ OUTLIERS_TABLE = TableSpec(
     "outliers",
     "tab:outliers",
     "strays and flipped normals",
-    _outlier_cells,
+    _outlier_jobs,
     outlier_tables,
     outlier_plots,
     sheets=True,
 )
 UNDERTRAINED_TABLE = TableSpec(
-    "undertrained", "tab:undertrained", "short coarse stages", _undertrained_cells, undertrained_tables
+    "undertrained", "tab:undertrained", "short coarse stages", _undertrained_jobs, undertrained_tables
 )
-DELTAS_TABLE = TableSpec("deltas", "tab:deltas", "measured band widths", _delta_cells, delta_tables)
+DELTAS_TABLE = TableSpec("deltas", "tab:deltas", "measured band widths", _delta_jobs, delta_tables)

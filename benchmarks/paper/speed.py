@@ -13,16 +13,16 @@ from mplicits.neural_fields import Field, Siren, extract_mesh
 from mplicits.pipelines.training.trainer import seeded
 
 from ..costs.speed import NormalsBench
-from ..harness.cells import Findings, Method, Record, Workplace
+from ..harness.jobs import Context, Method, Record, Results
 from ..harness.tables import Column, Row, Table, Value
-from .base import base_cell, base_of, without_bands
-from .cells import PaperCell, TableSpec, select
+from .base import base_job, base_of, without_bands
+from .jobs import PaperJob, TableSpec, select
 from .judge import protocol_of
 from .ours import Ours
 from .published import PAPER_MODELS, TIME_AUTO, TIME_MC
 
 if TYPE_CHECKING:
-    from .cells import Preset
+    from .jobs import Preset
 
 Overrides = tuple[tuple[str, Any], ...]
 SIZES: Mapping[Preset, Overrides] = MappingProxyType(
@@ -42,7 +42,7 @@ REPEATS: Mapping[Preset, int] = MappingProxyType({"smoke": 1, "cpu": 3, "paper":
 WIDTH, DEPTHS = 256, (2, 3)
 
 
-class MarchingCubes(Method[PaperCell]):
+class MarchingCubes(Method[PaperJob]):
     """Seconds for a grid: one large SIREN, the multiscale field without and with its bands, and our own extraction."""
 
     name = "marching-cubes"
@@ -50,24 +50,24 @@ class MarchingCubes(Method[PaperCell]):
     source = "paper, Tab. time_mc"
     differs = "evaluation of the grid only, but for our own extraction, which is timed with its triangles"
 
-    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
+    def settings(self, job: PaperJob) -> Mapping[str, Any]:
         """See `Method.settings`."""
-        fit = Ours().settings(base_cell(cell, SIZES[cell.preset]))
-        return {**fit, "baseline": BASELINE, "every": EVERY[cell.preset]}
+        fit = Ours().settings(base_job(job, SIZES[job.preset]))
+        return {**fit, "baseline": BASELINE, "every": EVERY[job.preset]}
 
-    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+    def run(self, job: PaperJob, context: Context) -> Results:
         """See `Method.run`: one output per scheme, each with its "seconds"."""
-        field = base_of(cell, work, SIZES[cell.preset]).field
-        resolution, every = protocol_of(cell.preset).resolution, EVERY[cell.preset]
-        with seeded(cell.seed):
-            baseline = Siren(*BASELINE).to(work.device).requires_grad_(False)
+        field = base_of(job, context, SIZES[job.preset]).field
+        resolution, every = protocol_of(job.preset).resolution, EVERY[job.preset]
+        with seeded(job.seed):
+            baseline = Siren(*BASELINE).to(context.device).requires_grad_(False)
         grids = {"baseline": baseline, "without culling": without_bands(field), "with culling": field}
         seconds = {name: grid_seconds(grid, resolution, every=every) for name, grid in grids.items()}
         started = time.perf_counter()
         mesh = extract_mesh(field, resolution=resolution, normals=False)
         seconds["ours"] = time.perf_counter() - started
         outputs = [{"name": name, "seconds": spent} for name, spent in seconds.items()]
-        return Findings(tuple(outputs), tuple(field.deltas.tolist()), {"vertices": len(mesh.vertices)})
+        return Results(tuple(outputs), tuple(field.deltas.tolist()), {"vertices": len(mesh.vertices)})
 
 
 @torch.inference_mode()
@@ -90,7 +90,7 @@ def grid_seconds(field: Field, resolution: int, *, every: int = 1) -> float:
     return (time.perf_counter() - started) * (resolution + 1) / len(slabs)
 
 
-class Normals(Method[PaperCell]):
+class Normals(Method[PaperJob]):
     """Seconds for value and gradient at as many points as an image has pixels; ``overrides``: depth, side.
 
     What they cost does not depend on the shape, so the weights are random ones.
@@ -100,25 +100,25 @@ class Normals(Method[PaperCell]):
     source = "paper, supplement, Tab. time_auto"
     differs = "random weights; the first shape stands for all"
 
-    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
+    def settings(self, job: PaperJob) -> Mapping[str, Any]:
         """See `Method.settings`."""
-        return {"width": WIDTH, "repeats": REPEATS[cell.preset]}
+        return {"width": WIDTH, "repeats": REPEATS[job.preset]}
 
-    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+    def run(self, job: PaperJob, context: Context) -> Results:
         """See `Method.run`: outputs "autograd", "algorithm 1" and "ours", each with its "seconds"."""
-        choice = dict(cell.overrides)
+        choice = dict(job.overrides)
         points, size = int(choice["side"]) ** 2, (WIDTH, int(choice["depth"]))
-        bench = NormalsBench(points=points, repeats=REPEATS[cell.preset], device=work.device, seed=cell.seed)
+        bench = NormalsBench(points=points, repeats=REPEATS[job.preset], device=context.device, seed=job.seed)
         row = bench.timed(*size)
         times = {"autograd": row.autograd, "algorithm 1": row.printed, "ours": row.jet}
         outputs = [{"name": name, "seconds": seconds} for name, seconds in times.items()]
-        return Findings(tuple(outputs), details={"largest_difference": row.largest_difference})
+        return Results(tuple(outputs), details={"largest_difference": row.largest_difference})
 
 
-def marching_cubes_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
+def marching_cubes_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
     """For each shape the fit of the paper's sizes for this table, and its timing."""
-    timed = [PaperCell(shape, MarchingCubes.name, preset) for shape in shapes]
-    return [*(base_cell(cell, SIZES[preset]) for cell in timed), *timed]
+    timed = [PaperJob(shape, MarchingCubes.name, preset) for shape in shapes]
+    return [*(base_job(job, SIZES[preset]) for job in timed), *timed]
 
 
 def marching_cubes_tables(records: Sequence[Record]) -> tuple[Table, ...]:
@@ -170,10 +170,10 @@ def _published_grid(shape: str) -> tuple[Value, ...] | None:
     return None
 
 
-def normals_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
-    """One cell per network and number of points."""
+def normals_jobs(shapes: Sequence[Path], preset: Preset) -> list[PaperJob]:
+    """One job per network and number of points."""
     return [
-        PaperCell(shapes[0], Normals.name, preset, overrides=(("depth", depth), ("side", side)))
+        PaperJob(shapes[0], Normals.name, preset, overrides=(("depth", depth), ("side", side)))
         for depth in DEPTHS
         for side in SIDES[preset]
     ]
@@ -222,7 +222,7 @@ MARCHING_CUBES = TableSpec(
     "marching-cubes",
     "Tab. time_mc",
     "what evaluating a grid costs, with and without bands",
-    marching_cubes_cells,
+    marching_cubes_jobs,
     marching_cubes_tables,
 )
-NORMALS = TableSpec("normals", "Tab. time_auto", "gradients by hand and by autograd", normals_cells, normals_tables)
+NORMALS = TableSpec("normals", "Tab. time_auto", "gradients by hand and by autograd", normals_jobs, normals_tables)

@@ -16,7 +16,7 @@ from mplicits.pipelines.training.trainer import seeded
 from scipy.special import stdtrit
 
 from ..harness.benchmark import Benchmark, Part, one_of_each, plain
-from ..harness.cells import Workplace, read_record
+from ..harness.jobs import Context, read_record
 from ..harness.tables import Column, Figure, Table, tabulated
 from .reconstruct import ALIKE, UNUSED, BenchScene, ReconstructBench
 from .reconstruct_rows import MULTISCALE, NEUS, ReconstructRow
@@ -24,7 +24,7 @@ from .reconstruct_rows import MULTISCALE, NEUS, ReconstructRow
 SINGLE = "single"
 GEOMETRIES = (MULTISCALE, NEUS, SINGLE)
 FACTORS = ("color_rate", "sharpening")  # rates in units of the geometry's
-APART = (*UNUSED, "seed", "learning_rate")  # settings that are in the cells, or change no row
+APART = (*UNUSED, "seed", "learning_rate")  # settings that are in the jobs, or change no row
 
 
 @dataclass(frozen=True)
@@ -153,8 +153,8 @@ class GeometryBench(Benchmark[GeometryRow]):
     resolution: int = 256
     samples: int = 500_000
 
-    def cells(self) -> list[Part]:
-        """One for each training, all of a seed before the next; see `Benchmark.cells`.
+    def jobs(self) -> list[Part]:
+        """One for each training, all of a seed before the next; see `Benchmark.jobs`.
 
         Those of the first seed have a rate each; the others find theirs when those are done.
         """
@@ -166,20 +166,20 @@ class GeometryBench(Benchmark[GeometryRow]):
         return first + [self.part(scene, kind, self.rates, seed) for seed in others for scene, kind in some]
 
     def part(self, scene: BenchScene, geometry: str, rate: float | tuple[float, ...], seed: int) -> Part:
-        """The cell of a training, with a rate, or with that of several which is the best one of the first seed."""
+        """The job of a training, with a rate, or with that of several which is the best one of the first seed."""
         what = (("scene", scene.name), ("pictures", scene.digest), ("geometry", geometry), ("rate", rate))
         rates = "its rate" if isinstance(rate, tuple) else f"{rate:g}"
         return Part(self.name, f"{scene.name}, {geometry}, {rates}, seed {seed}", options=(*what, ("seed", seed)))
 
-    def goes_on(self, cell: Part) -> bool:
+    def goes_on(self, job: Part) -> bool:
         """See `Method.goes_on`: the other seeds wait for the rates of the first."""
-        return isinstance(cell.parameters["rate"], tuple)
+        return isinstance(job.parameters["rate"], tuple)
 
-    def settings(self, cell: Part) -> Mapping[str, Any]:
-        """See `Benchmark.settings`; with the rate of the colours, which the cell's own does not change."""
+    def settings(self, job: Part) -> Mapping[str, Any]:
+        """See `Benchmark.settings`; with the rate of the colours, which the job's own does not change."""
         config = {name: value for name, value in plain(self.config).items() if name not in APART}
         fixed = {name: self.config.learning_rate * getattr(self.config, name) for name in FACTORS}
-        return {**super().settings(cell), "config": config, "rates": fixed}
+        return {**super().settings(job), "config": config, "rates": fixed}
 
     def _training(self, scene: BenchScene, geometry: str, rate: float, seed: int) -> _Training:
         fixed = {name: self.config.learning_rate / rate * getattr(self.config, name) for name in FACTORS}
@@ -189,22 +189,22 @@ class GeometryBench(Benchmark[GeometryRow]):
         config = dataclasses.replace(self.config, **changes)
         return _Training(scenes=[scene], config=config, geometry=geometry, **options)
 
-    def measure(self, cell: Part, work: Workplace) -> list[GeometryRow]:
+    def measure(self, job: Part, context: Context) -> list[GeometryRow]:
         """See `Benchmark.measure`; a training that is interrupted begins anew."""
-        of = cell.parameters
+        of = job.parameters
         scene = next(scene for scene in self.scenes if scene.name == of["scene"])
         kind, rate, seed = of["geometry"], of["rate"], of["seed"]
         if isinstance(rate, tuple):
-            tried = [row for one in rate for row in self._kept(self.part(scene, kind, one, 0), work)]
-            # Under a cell of its own, the training is still there when other rates are tried.
-            return self._kept(self.part(scene, kind, best_rate(tried), seed), work)
-        row = self._training(scene, kind, rate, seed).trained(scene, kind, None, work)
+            tried = [row for one in rate for row in self._kept(self.part(scene, kind, one, 0), context)]
+            # Under a job of its own, the training is still there when other rates are tried.
+            return self._kept(self.part(scene, kind, best_rate(tried), seed), context)
+        row = self._training(scene, kind, rate, seed).trained(scene, kind, None, context)
         return [GeometryRow(kind, rate, seed, row)]
 
-    def _kept(self, cell: Part, work: Workplace) -> list[GeometryRow]:
-        """The rows of another cell, which is done first, unless it has been done."""
-        assert work.first is not None
-        where = work.first(cell)
+    def _kept(self, job: Part, context: Context) -> list[GeometryRow]:
+        """The rows of another job, which is done first, unless it has been done."""
+        assert context.first is not None
+        where = context.first(job)
         record = read_record(where.out, where.key)
         assert record is not None
         return self.read([record])

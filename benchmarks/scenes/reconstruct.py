@@ -29,7 +29,7 @@ from mplicits.pipelines.training.settings import ReconstructConfig, closest
 from mplicits.pipelines.training.trainer import Interrupted, Progress, parameter_count, stop_on_signals
 
 from ..harness.benchmark import Benchmark, Part, network_name, one_of_each, plain
-from ..harness.cells import Catalogue, Workplace, read_record, record_file
+from ..harness.jobs import Context, Registry, read_record, record_file
 from ..harness.tables import Table
 from .flops import LateRows, Watched, train_watched
 from .reconstruct_rows import (
@@ -109,8 +109,8 @@ class ReconstructBench(Benchmark[ReconstructRow]):
     samples: int = 500_000
     neus_learning_rate: float = 1e-3
 
-    def cells(self) -> list[Part]:
-        """One for each row; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One for each row; see `Benchmark.jobs`."""
         one_of_each([scene.name for scene in self.scenes], "scenes")
         return [self.part(scene, kind) for scene in self.scenes for kind in self.kinds]
 
@@ -120,7 +120,7 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         return (NEUS, MULTISCALE, EQUAL_TIME) if self.equal_time else (NEUS, MULTISCALE)
 
     def part(self, scene: BenchScene, kind: str) -> Part:
-        """The cell of a row."""
+        """The job of a row."""
         what = (("scene", scene.name), ("kind", kind), ("pictures", scene.digest))
         return Part(self.name, f"{scene.name}, {kind}", options=(*what, ("views", len(self.views(scene)[1]))))
 
@@ -132,10 +132,10 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         colors = {"color_width": 256, "color_depth": 4, "color_frequencies": 0, "color_grid": 0}
         return dataclasses.replace(self.config, geometry="neus", **ALIKE, **colors, **rates)
 
-    def settings(self, cell: Part) -> Mapping[str, Any]:
+    def settings(self, job: Part) -> Mapping[str, Any]:
         """See `Benchmark.settings`; of the row's own settings those that change it."""
-        config = plain(self.config_of(cell.parameters["kind"]))
-        return {**super().settings(cell), "config": {k: v for k, v in config.items() if k not in UNUSED}}
+        config = plain(self.config_of(job.parameters["kind"]))
+        return {**super().settings(job), "config": {k: v for k, v in config.items() if k not in UNUSED}}
 
     def views(self, scene: BenchScene) -> tuple[list[PosedImage], list[PosedImage]]:
         """What is trained on, and what is measured.
@@ -149,38 +149,38 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         chosen = np.unique(np.linspace(0, len(tests) - 1, min(self.test_views, len(tests))).round().astype(int))
         return train, [tests[index] for index in chosen]
 
-    def measure(self, cell: Part, work: Workplace) -> list[ReconstructRow]:
+    def measure(self, job: Part, context: Context) -> list[ReconstructRow]:
         """See `Benchmark.measure`; a training that is interrupted begins anew."""
-        kind = cell.parameters["kind"]
-        scene = next(scene for scene in self.scenes if scene.name == cell.parameters["scene"])
+        kind = job.parameters["kind"]
+        scene = next(scene for scene in self.scenes if scene.name == job.parameters["scene"])
         seconds = None
         if kind == EQUAL_TIME:
-            assert work.first is not None
-            record = read_record(work.out, work.first(self.part(scene, NEUS)).key)
+            assert context.first is not None
+            record = read_record(context.out, context.first(self.part(scene, NEUS)).key)
             assert record is not None
             seconds = record["outputs"][0]["seconds"]
-        row = self.trained(scene, kind, seconds, work)
-        key = Catalogue([self]).key
+        row = self.trained(scene, kind, seconds, context)
+        key = Registry([self]).key
         if kind == NEUS:  # the row of equal time belongs to the time of another training
-            record_file(work.out, key(self.part(scene, EQUAL_TIME))).unlink(missing_ok=True)
+            record_file(context.out, key(self.part(scene, EQUAL_TIME))).unlink(missing_ok=True)
         sheets = []
         for part in (self.part(scene, other) for other in self.kinds):
-            record = read_record(work.out, key(part))
-            rows = [row] if part == cell else [] if record is None else self.read([record])
-            sheets += [(one, Workplace(work.out, key(part)).picture("views")) for one in rows]
+            record = read_record(context.out, key(part))
+            rows = [row] if part == job else [] if record is None else self.read([record])
+            sheets += [(one, Context(context.out, key(part)).picture("views")) for one in rows]
         there = [(one, picture) for one, picture in sheets if picture.is_file()]
-        write_picture(work.out / f"{scene.name}.png", common_sheet(there, self.views(scene)[1][:SHEET_VIEWS]))
+        write_picture(context.out / f"{scene.name}.png", common_sheet(there, self.views(scene)[1][:SHEET_VIEWS]))
         return [row]
 
     def build(self, config: ReconstructConfig, *, has_masks: bool, views: int) -> SceneModel:
         """An untrained scene; see `build_scene`."""
         return build_scene(config, has_masks=has_masks, views=views)
 
-    def trained(self, scene: BenchScene, kind: str, seconds: float | None, work: Workplace) -> ReconstructRow:
+    def trained(self, scene: BenchScene, kind: str, seconds: float | None, context: Context) -> ReconstructRow:
         """Train, measure, write pictures and the mesh."""
         config, similarity, device = self.config_of(kind), scene.images.similarity, choose_device(self.device)
         (train, tests), stage = self.views(scene), f"{scene.name}, {kind}"
-        report = work.progress or (lambda _: None)
+        report = context.progress or (lambda _: None)
         report(Progress(stage, 0, config.steps, 0.0, {}))
         started, has_masks = time.perf_counter(), all(view.mask is not None for view in train)
         model = self.build(config, has_masks=has_masks, views=len(train)).to(device)
@@ -193,17 +193,17 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         with stop_on_signals() as flag:
             watched = train_watched(model, pool, config, flag, seconds=seconds, report=told)
         if not watched.finished:
-            raise Interrupted(work.out)
+            raise Interrupted(context.out)
         objective, level = watched.trainer.objective, watched.trainer.objective.level_at(watched.trainer.fraction)
         model.requires_grad_(False)
         pairs: list[tuple[PosedImage, ViewImage]] = []
         for done, view in enumerate(tests, start=1):
             pairs.append((view, render_image(model, view, similarity, objective.sampling, level=level)))
             report(Progress(f"{stage}: held-out views", done, len(tests), done / len(tests), {}))
-        write_picture(work.picture("views"), comparison_sheet(pairs[:SHEET_VIEWS], model.background))
+        write_picture(context.picture("views"), comparison_sheet(pairs[:SHEET_VIEWS], model.background))
         mesh = self._mesh(model)
         if mesh is not None:
-            write_mesh(work.mesh("surface"), mesh, similarity)
+            write_mesh(context.mesh("surface"), mesh, similarity)
         name, surface = environment(device)["device"], self._surface(mesh, scene)
         return row_of(scene, kind, config, watched, pairs, surface, start_seconds=start_seconds, device=name)
 

@@ -42,7 +42,7 @@ from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Report
 
 from ..harness.benchmark import Benchmark, Part, plain
-from ..harness.cells import Workplace, key_of
+from ..harness.jobs import Context, key_of
 from ..harness.tables import Column, Figure, Table, tabulated
 from .roughness import Roughness, surface_roughness
 
@@ -151,22 +151,22 @@ class FitBench(Benchmark[FitRow]):
     poisson_depth: int = 10
     pictures: Path | None = None
 
-    def cells(self) -> list[Part]:
-        """One for each shape; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One for each shape; see `Benchmark.jobs`."""
         for shape in self.shapes:
             read_reference(shape)
         poisson = (("poisson", has_poisson()), ("pictures", None if self.pictures is None else str(self.pictures)))
         return [Part(self.name, Path(shape).stem, (Path(shape),), poisson) for shape in self.shapes]
 
-    def measure(self, cell: Part, work: Workplace) -> list[FitRow]:
+    def measure(self, job: Part, context: Context) -> list[FitRow]:
         """See `Benchmark.measure`."""
-        (path,), seed = cell.files, self.config.seed
+        (path,), seed = job.files, self.config.seed
         reference = read_reference(path)
         cloud, drawing = self.cloud_of(path)
         rows: list[FitRow] = []
         drawn: list[tuple[str, Mesh]] = [("input", from_cloud(cloud))]
-        home = fit_home(work.out, path, self.config, noise=self.noise, **drawing)
-        for method, seconds, mesh_seconds, mesh in self.reconstructions(cloud, home, work.stage(path.stem)):
+        home = fit_home(context.out, path, self.config, noise=self.noise, **drawing)
+        for method, seconds, mesh_seconds, mesh in self.reconstructions(cloud, home, context.stage(path.stem)):
             metrics = rough = None
             if mesh is not None:
                 metrics = evaluate_surfaces(mesh, reference, samples=self.samples, seed=seed)
@@ -380,18 +380,18 @@ class ScaleBench(Benchmark[ScaleRow]):
     resolution: int = 256
     samples: int = 500_000
 
-    def cells(self) -> list[Part]:
-        """One for each size; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One for each size; see `Benchmark.jobs`."""
         if self.shape is not None and not len(read_surface(self.shape).faces):
             raise InputError(f"{self.shape}: has no faces, so there is no surface to draw points from; give a mesh")
         files = () if self.shape is None else (Path(self.shape),)
         return [Part(self.name, f"{count:,} points", files, (("points", count),)) for count in self.counts]
 
-    def measure(self, cell: Part, work: Workplace) -> list[ScaleRow]:
+    def measure(self, job: Part, context: Context) -> list[ScaleRow]:
         """See `Benchmark.measure`."""
-        count = cell.parameters["points"]
-        path = (self.folder or work.out) / f"cloud_{count}.ply"
-        work.say(cell.name)
+        count = job.parameters["points"]
+        path = (self.folder or context.out) / f"cloud_{count}.ply"
+        context.say(job.name)
         surface = read_surface(self.shape) if self.shape else extract_mesh(Statue(), resolution=384)
         try:
             write_noisy_cloud(path, surface, count, noise=self.noise, seed=self.config.seed)

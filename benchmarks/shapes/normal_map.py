@@ -26,7 +26,7 @@ from mplicits.pipelines.training.trainer import parameter_count
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, tabulated
 from .compare import ImageError, draw, image_error, psnr
 
@@ -120,29 +120,29 @@ class NormalMapBench(Benchmark[NormalMapRow]):
     repeats: int = 2
     picture: Path | None = None
 
-    def cells(self) -> list[Part]:
-        """One; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One; see `Benchmark.jobs`."""
         if self.picture is not None:
             check_picture_path(self.picture)
         file, reference = find_field(self.run_file), Path(self.reference)
         read_reference(reference)
         return [Part(self.name, f"{file.parent.name} against {reference.name}", (file, reference))]
 
-    def measure(self, cell: Part, work: Workplace) -> list[NormalMapRow]:
+    def measure(self, job: Part, context: Context) -> list[NormalMapRow]:
         """See `Benchmark.measure`."""
-        (file, reference), place, shading = cell.files, choose_device(self.device), self.shading
+        (file, reference), place, shading = job.files, choose_device(self.device), self.shading
         field, similarity, _ = load_field(file, device=place)
         if field.num_levels < 2:
             raise InputError(f"{file}: has one level; normals are mapped from a finer level to a coarser one")
         original = read_reference(reference).moved(similarity)
         _check_place(field, original, f"{reference}", place)
         cameras = turntable(original.used_vertices(), self.views, width=self.size, height=self.size, up=self.up)
-        work.say("the original")
+        context.say("the original")
         truth = [(mesh_view(original, camera), camera) for camera in cameras]
         wanted = [draw(seen, shade(seen, shading, camera=c, options=PLAIN)) for seen, c in truth]
         rows, lines = [], [[("original", _image(seen, c, shading))] for seen, c in truth]
-        for method in _methods(field, f"{file}", self.resolution, place, work.say):
-            work.say(method.name)
+        for method in _methods(field, f"{file}", self.resolution, place, context.say):
+            context.say(method.name)
             method.view(cameras[0].resized(64, 64))  # the first call pays for what later ones find ready
             timed = [_best(method.view, camera, shading, self.repeats) for camera in cameras]
             drawings = [draw(seen, colors) for _, seen, colors in timed]

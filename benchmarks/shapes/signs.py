@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..harness.benchmark import Benchmark, Part
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, tabulated
 from .fits import clouds_of
 
@@ -85,15 +85,15 @@ class SignsBench(Benchmark[SignsRow]):
     isotropic: bool = False
     points: int | None = None
 
-    def cells(self) -> list[Part]:
-        """One for each shape; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One for each shape; see `Benchmark.jobs`."""
         for shape in self.shapes:
             read_reference(shape)
         return [Part(self.name, Path(shape).stem, (Path(shape),)) for shape in self.shapes]
 
-    def measure(self, cell: Part, work: Workplace) -> list[SignsRow]:
+    def measure(self, job: Part, context: Context) -> list[SignsRow]:
         """See `Benchmark.measure`."""
-        (path,), seed = cell.files, self.config.seed
+        (path,), seed = job.files, self.config.seed
         about = {"points": self.points, "noise": self.noise, "isotropic": self.isotropic, "seed": seed}
         clean, noisy = clouds_of(path, **about)
         if clean.normals is None:
@@ -107,7 +107,7 @@ class SignsBench(Benchmark[SignsRow]):
         points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
         places = Places.around(CloudDistance(points, normals), seed=seed)
         device = choose_device(self.device)
-        signs = give_signs(points, normals, config, device=device, places=places, report=work.stage(path.stem))
+        signs = give_signs(points, normals, config, device=device, places=places, report=context.stage(path.stem))
         assert signs is not None  # it gets no stop flag
         against = (cloud.normals * exact).sum(axis=1) < 0
         return [

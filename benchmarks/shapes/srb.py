@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..harness.benchmark import Benchmark, Part
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Row, Table, tabulated
 from .fits import fit_home, has_poisson, kept_fit, screened_poisson, timed_mesh
 from .sampled_error import approximation_error, near_surface
@@ -221,8 +221,8 @@ class SrbBench(Benchmark[SrbRow]):
     samples: int = 1_000_000
     poisson_depth: int = 10
 
-    def cells(self) -> list[Part]:
-        """One for each scan, with the file's normals and without; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One for each scan, with the file's normals and without; see `Benchmark.jobs`."""
         scans = find_scans(self.folder)
         known = {scan.shape for scan in scans}
         for shape in self.shapes:
@@ -242,16 +242,16 @@ class SrbBench(Benchmark[SrbRow]):
             raise InputError(f"{self.folder}: no scan has normals; ask for the rows without them (--rows none)")
         return parts
 
-    def measure(self, cell: Part, work: Workplace) -> list[SrbRow]:
+    def measure(self, job: Part, context: Context) -> list[SrbRow]:
         """See `Benchmark.measure`."""
-        scan, truth_file = cell.files
-        shape, given = cell.parameters["shape"], cell.parameters["normals"]
+        scan, truth_file = job.files
+        shape, given = job.parameters["shape"], job.parameters["normals"]
         cloud = read_cloud(scan)
         config = dataclasses.replace(self.config, normals="estimate") if given == "none" else self.config
         judge = _Judge(read_surface(truth_file), cloud, self.samples, config.seed)
         rows = []
-        home = fit_home(work.out, scan, config)
-        for method, seconds, mesh, error in self.reconstructions(cloud, home, config, judge, work):
+        home = fit_home(context.out, scan, config)
+        for method, seconds, mesh, error in self.reconstructions(cloud, home, config, judge, context):
             figures = judge.figures(mesh)
             rows.append(
                 SrbRow(
@@ -267,10 +267,10 @@ class SrbBench(Benchmark[SrbRow]):
         return rows
 
     def reconstructions(
-        self, cloud: PointCloud, home: Path, config: FitConfig, judge: _Judge, work: Workplace
+        self, cloud: PointCloud, home: Path, config: FitConfig, judge: _Judge, context: Context
     ) -> Iterator[tuple[str, float, Mesh | None, float | None]]:
         """Method, its seconds, the mesh in the scan's coordinates, and the error of the field in the band."""
-        run = kept_fit(home, cloud, config, progress=work.stage(home.name))
+        run = kept_fit(home, cloud, config, progress=context.stage(home.name))
         seconds = 0.0
         for level, stage in enumerate(run.record["stages"]):
             seconds += stage["sampling_seconds"] + stage["training_seconds"]

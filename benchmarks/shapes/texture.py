@@ -32,7 +32,7 @@ from mplicits.pipelines.training.folder import TEXTURE_FILE, digest_of, find_fie
 from mplicits.pipelines.training.settings import FitConfig, TextureConfig
 
 from ..harness.benchmark import Benchmark, Part, network_name, one_of_each
-from ..harness.cells import Workplace
+from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, tabulated
 from .compare import Drawing, ImageError, draw, image_error, psnr
 from .fits import fit_home, kept_fit
@@ -147,28 +147,28 @@ class TextureBench(Benchmark[TextureRow]):
     up: str = "y"
     resolution: int = 256
 
-    def cells(self) -> list[Part]:
-        """One for each mesh; see `Benchmark.cells`."""
+    def jobs(self) -> list[Part]:
+        """One for each mesh; see `Benchmark.jobs`."""
         paths = [Path(path) for path in self.meshes]
         found = [(path, _read(path)) for path in paths]
         one_of_each([path.stem for path in paths], "meshes")
         return [Part(self.name, path.stem, (path,), (("image", _digest(mesh)),)) for path, mesh in found]
 
-    def measure(self, cell: Part, work: Workplace) -> list[TextureRow]:
+    def measure(self, job: Part, context: Context) -> list[TextureRow]:
         """See `Benchmark.measure`; raises `KeyboardInterrupt` where the training of a texture was stopped."""
-        (path,), shape = cell.files, cell.name
+        (path,), shape = job.files, job.name
         mesh = _read(path)
         configs = {"coarse": self.coarse} | ({} if self.full is None else {"full": self.full})
-        fits = [self.fitted(path, mesh, config, name, work) for name, config in configs.items()]
+        fits = [self.fitted(path, mesh, config, name, context) for name, config in configs.items()]
         outline = mesh.vertices[np.unique(mesh.faces)]
         cameras = turntable(outline, self.views, width=self.size, height=self.size, up=self.up)
-        work.say(f"{shape}: the original")
+        context.say(f"{shape}: the original")
         wanted = [_original(mesh, camera, self.samples) for camera in cameras]
-        series = self.drawn(shape, fits, cameras, work.say)
-        write_picture(work.out / f"{shape}.png", _sheet(wanted, series[: len(fits)]))
+        series = self.drawn(shape, fits, cameras, context.say)
+        write_picture(context.out / f"{shape}.png", _sheet(wanted, series[: len(fits)]))
         return [_row(shape, one, image_error(zip(wanted, one.drawings, strict=True))) for one in series]
 
-    def fitted(self, path: Path, mesh: TexturedMesh, config: FitConfig, name: str, work: Workplace) -> Fitted:
+    def fitted(self, path: Path, mesh: TexturedMesh, config: FitConfig, name: str, context: Context) -> Fitted:
         """A surface and its texture; whatever is not in the folder of the results yet is trained.
 
         Raises:
@@ -176,7 +176,7 @@ class TextureBench(Benchmark[TextureRow]):
             KeyboardInterrupt: the texture was stopped; the next call trains it anew.
         """
         more = {"image": _digest(mesh), "points": FIT_POINTS, "texture": asdict(self.texture) | {"device": None}}
-        run, progress = fit_home(work.out, path, config, **more), work.stage(f"{path.stem} {name}")
+        run, progress = fit_home(context.out, path, config, **more), context.stage(f"{path.stem} {name}")
         kept_fit(run, sample_textured(mesh, FIT_POINTS, seed=config.seed), config, progress=progress)
         trained = (run / TEXTURE_FILE).is_file() and read_record(run).get("texture", {}).get("finished", False)
         if not trained and not texture_run(run, path, self.texture, progress=progress).record["finished"]:

@@ -141,10 +141,10 @@ class UnevenBench(FitBench):
     density: str | None = None
     ratio: float = 30.0
 
-    def cells(self) -> list[Part]:
+    def jobs(self) -> list[Part]:
         """One for each shape; exact ones are meshed first."""
         if self.shapes:
-            return super().cells()
+            return super().jobs()
         self.folder.mkdir(parents=True, exist_ok=True)
         files = []
         for name, (field, _) in exact_shapes().items():

@@ -70,7 +70,7 @@ RUN_FILES = {
     "run.json": "the settings, the cloud, the steps and times, the errors of each level",
     "texture.safetensors": "the colours, for this field alone",
     "radiance.safetensors": "the colours by direction and the background, of `reconstruct`",
-    "support.safetensors": "points where the surface was seen; far from them parts of a mesh are removed",
+    "support.safetensors": "points where the surface is visible; parts of a mesh far from them are removed",
     "velocity.safetensors": "the motion, of `evolve --kind deform`",
     "cloud.ply": "the cloud made of depth maps",
     "resume.safetensors": "the state of a training that is not finished; `--resume` goes on from it",

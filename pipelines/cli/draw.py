@@ -236,7 +236,7 @@ def _animate_arguments(parser: argparse.ArgumentParser) -> None:
     add("--ease", action="store_true", help="begin and end at rest, instead of times that are evenly spaced")
     add("--loop", action="store_true", help="film: there and back, so that it can repeat without a jump")
     add_flags(parser, "--level", "--device")
-    add("--colors", metavar="RUN", help="a textured run of the first shape, to ride along (default: RUN's own)")
+    add("--colors", metavar="RUN", help="a textured run of the first shape, to transport (default: RUN's own)")
     add("--last-colors", metavar="RUN", help="a textured run of the last shape, whose colours fade in on the way")
     add("--no-colors", action="store_true", help="leave colours out")
     add_flags(parser, "--resolution", help="meshes: cells per side (128)")

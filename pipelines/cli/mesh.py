@@ -31,7 +31,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     add("--texture-faces", type=whole(4), metavar="N", help="triangles to keep with --texture (50000)")
     what = "about how many triangles to keep, with the distance to the full mesh stated (needs mplicits[texture])"
     add("--faces", type=whole(4), metavar="N", help=what)
-    add("--seen", action="store_true", help="leave out what fewer than two photographs have seen (of reconstruct)")
+    add("--seen", action="store_true", help="leave out what is visible in fewer than two photographs (of reconstruct)")
     add("--keep-unsupported", action="store_true", help="keep components that no input points support, too")
     add("--keep-largest", action="store_true", help="keep only the component of largest area")
     what = "drop faces further than D (input units) from the points: holes stay holes"

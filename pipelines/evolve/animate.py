@@ -120,7 +120,7 @@ def animate_run(
 def _transported(
     file: Path, field: Field, similarity: Similarity, level: int, options: SequenceOptions
 ) -> TransportedColors | None:
-    """The colours that ride along, if there are any."""
+    """The transported colours, if there are any."""
     if options.no_colors:
         return None
     motion = load_motion(file)

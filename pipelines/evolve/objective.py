@@ -11,7 +11,7 @@ from ...neural_fields.fields.losses import eikonal_loss
 from ...neural_fields.spacetime.evolution import key_loss, law_loss
 from ...neural_fields.spacetime.field import spacetime_jet
 from ..training.settings import EvolveConfig
-from ..training.trainer import Focus, Group, Objective, Report, Trainer, seeded, warm_cosine
+from ..training.trainer import ErrorWeightedSampler, Group, Objective, Report, Trainer, seeded, warm_cosine
 from .problem import Problem
 from .samples import Known, band_points, indices_in_band, uniform_spacetime
 
@@ -49,8 +49,8 @@ class EvolveObjective(Objective):
                 raise ValueError(f"level {level}: no known samples in its band")
         # Without a law, half of a batch of known samples is drawn by the error of the field there. Thin parts are few
         # samples of many, and smoothed away where all count alike.
-        self.focus = Focus(len(self.known), 0.0 if self.law else 0.5, device, strip=1)
-        self.kept |= self.focus.kept
+        self.sampler = ErrorWeightedSampler(len(self.known), 0.0 if self.law else 0.5, device, strip=1)
+        self.kept |= self.sampler.kept
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
@@ -61,7 +61,7 @@ class EvolveObjective(Objective):
             self.kept["pool"] = band_points(self.field, count, self.width, self.generator, level=self.level)
         pool = self.kept["pool"]
         half, part = config.batch // 2, config.batch // 16
-        rows = upload(self.focus.watched(step, self.kept).rows(half, self.generator), pool.device)
+        rows = upload(self.sampler.at_step(step, self.kept).rows(half, self.generator), pool.device)
         known = self.known.take(rows)
         bounds = self.bounds.take(self._draw(len(self.bounds), part if len(self.bounds) and not self.level else 0))
         anywhere = uniform_spacetime(0 if self.level else part, self.generator).to(pool.device)
@@ -81,7 +81,7 @@ class EvolveObjective(Objective):
         found = Jet(rest.value[: len(known)], rest.gradient[: len(known)], rest.features[: len(known)])
         target = Jet(known.value, known.gradient, found.features)
         wrong = key_loss(found, target, length=config.length)
-        self.focus.learn(rows, wrong.detach().sqrt())
+        self.sampler.learn(rows, wrong.detach().sqrt())
         terms = {"known": wrong.mean()}
         total = config.data_weights[self.level] * terms["known"]
         slopes = torch.cat((obeying.gradient, rest.gradient[len(known) :]))

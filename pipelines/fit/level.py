@@ -18,7 +18,7 @@ from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss,
 from ..training.settings import EvolveConfig, FitConfig
 from ..training.trainer import Group, Objective, seeded, warm_cosine
 from .cloud import drawn
-from .samples import SQUARES, Samples, Source, Usual, with_previous
+from .samples import SQUARES, RobustScales, Samples, Source, with_previous
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ class Judge:
         areas: Tensor | None = None,
         data: float,
         normal: float,
-        usual: Usual = SQUARES,
+        scales: RobustScales = SQUARES,
         guessed: bool = False,
         options: JudgeOptions = JUDGE,
     ) -> None:
@@ -253,7 +253,7 @@ class Judge:
         areas = torch.ones(len(points)) if areas is None else areas
         samples = Samples(points, distance=torch.zeros(len(points)), normal=normals, area=areas)
         self.samples = with_previous(samples, previous, delta, device=previous.like.device)
-        self.data, self.normal, self.usual, self.count = data, normal, usual, len(self.samples)
+        self.data, self.normal, self.scales, self.count = data, normal, scales, len(self.samples)
         self.guessed = guessed
         self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing, options=self.options))
         assert self.samples.value is not None
@@ -289,7 +289,7 @@ class Judge:
         # From the chord: the cosine of a small angle rounds to 1.
         chord = (torch.nn.functional.normalize(gradient, dim=1) - normal).norm(dim=1)
         angle = torch.rad2deg(2 * (chord.clamp(max=2) / 2).asin())
-        loss = self.data * pseudo_huber(data, self.usual.data) + self.normal * pseudo_huber(turn, self.usual.normal)
+        loss = self.data * pseudo_huber(data, self.scales.data) + self.normal * pseudo_huber(turn, self.scales.normal)
         return Each(loss, data.sqrt(), angle, self.samples.area)
 
 
@@ -331,12 +331,12 @@ class LevelObjective(Objective):
         for source, batch, value, gradient in pieces:
             if batch.value is not None and batch.gradient is not None:
                 value, gradient = value + batch.value, gradient + batch.gradient
-            usual = source.usual
-            parts = [("eikonal", source.eikonal, eikonal_loss(gradient), usual.eikonal)]
+            scales = source.scales
+            parts = [("eikonal", source.eikonal, eikonal_loss(gradient), scales.eikonal)]
             if batch.distance is not None:
-                parts.append(("data", source.data, data_loss(value, batch.distance), usual.data))
+                parts.append(("data", source.data, data_loss(value, batch.distance), scales.data))
             if batch.normal is not None:
-                parts.append(("normal", source.normal, normal_loss(gradient, batch.normal), usual.normal))
+                parts.append(("normal", source.normal, normal_loss(gradient, batch.normal), scales.normal))
             for name, weight, loss, scale in parts:
                 mean = pseudo_huber(loss, scale).mean()
                 total = total + weight * mean

@@ -35,7 +35,7 @@ class SampleOptions:
     guessed_slope: float = 0.2
     left: float = 0.4  # part of the noise that smoothing leaves without normals: median on six shapes with 0.5 and 1 %
     clear: float = 4.0  # distance to all points, in spacings, from which on a place is not between them
-    fewest: int = 32  # remote samples, below which they get no share of the batch
+    fewest: int = 32  # off-surface samples, below which they get no share of the batch
 
 
 SAMPLING = SampleOptions()
@@ -73,7 +73,7 @@ class Samples(Rows):
     area: Tensor | None = None  # weights for drawing; None for equal ones
 
 
-class Usual(NamedTuple):
+class RobustScales(NamedTuple):
     """Robust scale of each term of Eq. 4, see `pseudo_huber`; infinity leaves a term squared."""
 
     data: float = math.inf  # of (f(x) − d)²
@@ -81,8 +81,8 @@ class Usual(NamedTuple):
     eikonal: float = math.inf  # of (|∇f| − 1)²
 
 
-SQUARES = Usual()
-LEAST = Usual(1e-12, 1e-6, 1e-6)  # least scales: float32 rounds f to about 1e-7 and cosines to 6e-8
+SQUARES = RobustScales()
+LEAST = RobustScales(1e-12, 1e-6, 1e-6)  # least scales: float32 rounds f to about 1e-7 and cosines to 6e-8
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Source:
     data: float  # weight of (f(x) − d)²
     normal: float  # weight of 1 − cos(∇f, N)
     eikonal: float  # weight of (|∇f| − 1)²
-    usual: Usual = SQUARES
+    scales: RobustScales = SQUARES
 
 
 @dataclass(frozen=True)
@@ -112,8 +112,8 @@ class Weights:
         data = config.data_weight_after(float(errors.square().mean()), noise)
         given = (self.data, self.normal, self.eikonal)
         normal, slope = (SAMPLING.guessed_normal, SAMPLING.guessed_slope) if cloud.guessed else (1.0, 1.0)
-        usual = (data, normal * config.normal_weight, slope * config.eikonal_weight)
-        return tuple(u if g is None else g for g, u in zip(given, usual, strict=True))  # pyright: ignore[reportReturnType]
+        default = (data, normal * config.normal_weight, slope * config.eikonal_weight)
+        return tuple(d if g is None else g for g, d in zip(given, default, strict=True))  # pyright: ignore[reportReturnType]
 
 
 def first_sources(
@@ -140,7 +140,7 @@ def banded_sources(
     name: str = "cloud",
     options: SampleOptions = SAMPLING,
 ) -> list[Source]:
-    """Of a residual level: the cloud, offset points and band points around ``previous`` (Sec. 3.2), and remote places.
+    """Sources of a residual level: the cloud, and offset, band and off-surface samples around ``previous`` (Sec. 3.2).
 
     Where normals were estimated, `near_samples` replace the offsets, which rely on the sign of each normal. ``weights``
     replace those of the fit. Without samples of a kind, an `InputError` calls the cloud ``name``.
@@ -165,21 +165,21 @@ def banded_sources(
     assert surface.value is not None
     terms = (weights or Weights()).resolved(config, surface.value, index)
     third = config.batch // 3
-    usual = usual_errors(surface, kept["band"]) if config.robust_normals else SQUARES
+    scales = robust_scales(surface, kept["band"]) if config.robust_normals else SQUARES
     if previous.num_levels == 1:  # squares reach corners and thin parts that level 0 has missed
-        usual = usual._replace(data=math.inf)
-    sources = [Source(kind, samples, third, *terms, usual) for kind, samples in kept.items()]
-    # Another generator: the search changes nothing in the fit of a cloud without such places.
+        scales = scales._replace(data=math.inf)
+    sources = [Source(kind, samples, third, *terms, scales) for kind, samples in kept.items()]
+    # A generator of its own, so that the search leaves the fit of a cloud without such samples unchanged.
     own = torch.Generator().manual_seed(generator.initial_seed() + 1)
-    remote = remote_samples(index, previous, delta, config.samples, generator=own, device=device, options=options)
-    for kind, samples in remote._asdict().items():
+    found = off_surface_samples(index, previous, delta, config.samples, generator=own, device=device, options=options)
+    for kind, samples in found._asdict().items():
         if len(samples) >= options.fewest:
             sources.append(Source(kind, samples, third // 4, terms[0], 0.0, 0.0))
     return sources
 
 
-def usual_errors(surface: Samples, band: Samples) -> Usual:
-    """The medians of the terms for the levels before, as robust scales: errors of the smooth places.
+def robust_scales(surface: Samples, band: Samples) -> RobustScales:
+    """Robust scale of each term: its median for the levels before, which is the error on smooth faces.
 
     Errors at sharp edges are about ten times those of faces. Squared, they would dominate the loss and leave waves on
     the faces.
@@ -194,7 +194,7 @@ def usual_errors(surface: Samples, band: Samples) -> Usual:
         normal_loss(surface.gradient, surface.normal),
         eikonal_loss(band.gradient),
     )
-    return Usual(*(max(float(loss.quantile(0.5)), least) for loss, least in zip(losses, LEAST, strict=True)))
+    return RobustScales(*(max(float(loss.quantile(0.5)), least) for loss, least in zip(losses, LEAST, strict=True)))
 
 
 def surface_samples(index: CloudDistance) -> Samples:
@@ -214,15 +214,15 @@ def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Gener
     return Samples(points, distance=cloud.signed(points))
 
 
-class Remote(NamedTuple):
-    """Places of a band far from every point of the cloud, see `remote_samples`."""
+class OffSurface(NamedTuple):
+    """Samples of a band far from every point of the cloud, see `off_surface_samples`; field names are source names."""
 
     empty: Samples  # clearly inside or outside
-    unseen: Samples  # in doubt
+    unseen: Samples  # of uncertain sign
 
 
 @torch.no_grad()
-def remote_samples(
+def off_surface_samples(
     cloud: CloudDistance,
     field: Field,
     delta: float,
@@ -231,16 +231,16 @@ def remote_samples(
     generator: torch.Generator,
     device: torch.device,
     options: SampleOptions = SAMPLING,
-) -> Remote:
+) -> OffSurface:
     """Samples of the band around ``field`` that are far from every point of the cloud; often none.
 
-    ``empty``: the winding number shows that they are in- or outside, so the level before has invented a surface there.
-    Their distance is that to the nearest point, up to ±2δ, which takes them out of the next band. ``unseen``: the
-    winding number is in doubt, as in holes of scans; they keep the value of the level before. ``count`` points are
-    tried, spread as for level 0, and as many again around unseen ones.
+    ``empty``: the winding number is clear, so the level before has a spurious surface there. Their distance is that to
+    the nearest point, up to ±2δ, which takes them out of the next band. ``unseen``: the winding number is uncertain,
+    as in holes of scans; they keep the value of the level before. ``count`` points are tried, spread as for level 0,
+    and as many again around unseen ones.
     """
 
-    def found(tried: Tensor) -> Remote:
+    def found(tried: Tensor) -> OffSurface:
         samples = with_previous(Samples(tried), field, delta, device=device)
         points = samples.points.cpu().numpy()
         assert samples.value is not None
@@ -252,14 +252,14 @@ def remote_samples(
         length = np.minimum(distance[far[sure]], 2 * delta)
         signed = np.where(depth[sure] > 0, -length, length).astype(np.float32)
         empty = replace(empty, distance=torch.from_numpy(signed).to(device))
-        return Remote(empty, replace(unseen, distance=unseen.value))
+        return OffSurface(empty, replace(unseen, distance=unseen.value))
 
-    remote = found(spread_points(cloud, count, generator))
-    if len(remote.unseen) < options.fewest:
-        return remote
-    seeds = remote.unseen.points.cpu()[torch.randint(len(remote.unseen), (count,), generator=generator)]
+    first = found(spread_points(cloud, count, generator))
+    if len(first.unseen) < options.fewest:
+        return first
+    seeds = first.unseen.points.cpu()[torch.randint(len(first.unseen), (count,), generator=generator)]
     beside = seeds + (2 * torch.rand(count, 3, generator=generator) - 1) * 2 * delta
-    return Remote(remote.empty, found(beside.clamp(-DOMAIN, DOMAIN)).unseen)
+    return OffSurface(first.empty, found(beside.clamp(-DOMAIN, DOMAIN)).unseen)
 
 
 def spread_points(cloud: CloudDistance, count: int, generator: torch.Generator) -> Tensor:
@@ -391,11 +391,11 @@ def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None, options:
     """
     ordered = errors.abs().flatten().sort().values
     if quantile is None:
-        usual = min(
+        limit = min(
             q * ordered[math.ceil(share * len(ordered)) - 1]
             for q, share in ((options.stray, 0.99), (options.tail, 0.9))
         )
-        return (1 + epsilon) * float(ordered[ordered <= usual][-1])
+        return (1 + epsilon) * float(ordered[ordered <= limit][-1])
     return (1 + epsilon) * float(ordered[max(0, math.ceil(quantile * len(ordered)) - 1)])
 
 

@@ -33,8 +33,8 @@ from ..training.trainer import (
     restore_frozen,
     stop_on_signals,
 )
-from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
+from .densification import dense_distance
 from .level import JUDGE, LEVEL, Judge, LevelObjective, calm_omega, held_out, new_level
 from .review import review_points
 from .samples import DOMAIN, Band, Source, band_of, banded_sources, first_sources, with_wrong_sides
@@ -380,7 +380,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         assert self.frozen is not None
         points, normals = self.points[self.held], self.normals[self.held]
         areas = torch.from_numpy(self.indexed(len(self.stages)).nearest_gap(points.numpy())[1]) ** 2
-        terms = {"data": surface.data, "normal": surface.normal, "usual": surface.usual}
+        terms = {"data": surface.data, "normal": surface.normal, "scales": surface.scales}
         about = {"spacing": self.spacing, "areas": areas, "guessed": self.cloud.estimated}
         judge = Judge(points, normals, self.frozen, delta, **about, **terms)
         return judge if judge.count >= JUDGE.fewest / 2 else None

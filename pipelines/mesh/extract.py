@@ -20,7 +20,7 @@ from ...neural_fields import Field, InputError, Mesh, Similarity
 from ...neural_fields.backend.devices import upload
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh, map_normals
 from ...neural_fields.tracing.sphere import map_attribute
-from ..surface.surface import Support, in_region, keep_largest, read_support, seen_part, trim_distance, without_blobs
+from ..surface.surface import Support, in_region, keep_largest, read_support, trim_distance, visible_part, without_blobs
 from ..texture.transport import Colors, colors_of_run
 from ..training.folder import TEXTURE_FILE, chosen_level, find_field, fitted_cloud, load_still
 from .atlas import Decimation, check_tools, decimated
@@ -95,7 +95,7 @@ class MeshOptions:
         faces: triangles to keep of one that is not; None keeps all.
         report: whether to look at the mesh as a printer would; None does so for STL.
         keep_unsupported: whether to keep components that no input points support.
-        seen: whether to leave out what fewer than two photographs have seen, for a run of ``reconstruct``.
+        seen: whether to leave out what is visible in fewer than two photographs, for a run of ``reconstruct``.
         keep_largest: whether to keep only the component of largest area.
         trim_distance: drop faces further than this from the points, in input units.
         cloud: the points for that; by default the file that was fitted.
@@ -174,7 +174,7 @@ def export_run(
     level = chosen_level(field, file, options.level)
     normal_level = chosen_level(field, file, options.normal_level, otherwise=level, flag="--normal-level")
     support = None if options.time is not None else read_support(file, metadata.get("run", {}), level)
-    if options.seen and (support is None or not support.seen):
+    if options.seen and (support is None or not support.visible):
         raise InputError(f"--seen: {file} keeps no place that two photographs see; runs of `mplicits reconstruct` do")
     points = None
     if options.trim_distance is not None:
@@ -193,8 +193,8 @@ def export_run(
             raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
     if support is not None and not options.keep_unsupported:
         mesh = without_blobs(mesh, support.points, support.radius, say)
-    if support is not None and support.seen:
-        mesh = _seen(mesh, support, say, cut=options.seen)
+    if support is not None and support.visible:
+        mesh = _visible(mesh, support, say, cut=options.seen)
     if normal_level != level:
         mesh = map_normals(mesh, field, level=normal_level)
     if points is not None and options.trim_distance is not None:
@@ -230,7 +230,7 @@ def _resolution(
 ) -> int:
     """Cells per side; ``say`` is called with a warning if parts are too thin for them."""
     say = say or (lambda _: None)
-    if support is None or support.seen:
+    if support is None or support.visible:
         return asked or RESOLUTIONS[0]
     if asked is None:
         chosen = fineness(field, support.points, level=level)
@@ -249,15 +249,15 @@ def _resolution(
     return asked
 
 
-def _seen(mesh: Mesh, support: Support, say: Callable[[str], None] | None, *, cut: bool) -> Mesh:
-    """The part of a mesh that photographs have seen, with ``cut``; ``say`` is called if they missed much."""
-    part, missed = seen_part(mesh, support)
+def _visible(mesh: Mesh, support: Support, say: Callable[[str], None] | None, *, cut: bool) -> Mesh:
+    """The part of a mesh that is visible in the photographs, with ``cut``; ``say`` is called if much is not."""
+    part, missed = visible_part(mesh, support)
     if not cut or part is None:
         if say is not None and missed > 0.05:
-            say(f"{missed:.0%} of the surface is seen by fewer than two photographs; --seen leaves it out")
+            say(f"{missed:.0%} of the surface is visible in fewer than two photographs; --seen leaves it out")
         return mesh
     if say is not None and missed > 0:
-        say(f"left out {missed:.2g} of the area, which fewer than two photographs see")
+        say(f"left out {missed:.2g} of the area, which is visible in fewer than two photographs")
     return part
 
 

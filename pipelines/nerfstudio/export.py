@@ -19,10 +19,10 @@ from ...neural_fields.meshing.mesh import check_mesh_path
 from ..mesh.bake import check_texture_size, textured_mesh
 from ..mesh.extract import normals_near
 from ..mesh.files import check_textured_path
-from ..reconstruct.views import seen_points
-from ..surface.surface import Support, seen_part
+from ..reconstruct.views import visible_points
+from ..surface.surface import Support, visible_part
 
-__all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "part_seen"]
+__all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "visible_mesh"]
 
 Float64 = NDArray[np.float64]
 Move = tuple[Float64, float]  # (3, 4) and a scale: see `in_data_coordinates`
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--load-config", type=Path, required=True, help="config.yml of the training")
     parser.add_argument("--output-path", type=Path, required=True, help="PLY, OBJ, STL or GLB")
     parser.add_argument("--resolution", type=int, default=512, help="cells along the longest side of the scene box")
-    parser.add_argument("--seen", action="store_true", help="leave out what fewer than two photographs have seen")
+    parser.add_argument("--seen", action="store_true", help="leave out what is visible in fewer than two photographs")
     parser.add_argument("--texture", type=int, metavar="N", help="colours and normals as images of N × N (GLB, OBJ)")
     parser.add_argument("--texture-faces", type=int, default=50_000, help="triangles below the texture")
     parser.add_argument("--level", type=int, default=-1, help="of detail, 0 the coarsest, -1 the finest")
@@ -102,7 +102,7 @@ def export_mesh(
     move = np.asarray(outputs.dataparser_transform, np.float64), float(outputs.dataparser_scale)
     mesh = field.mesh(resolution, level=level, normals=texture is None)
     if seen:
-        mesh = part_seen(mesh, field, host_cameras(outputs.cameras))
+        mesh = visible_mesh(mesh, field, host_cameras(outputs.cameras))
     if texture is not None:
         mesh = in_data_coordinates(mesh, *move)
         return _textured(path, mesh, field.cpu(), move, texture, faces, level % field.field.num_levels)
@@ -152,18 +152,18 @@ def host_cameras(cameras: Any) -> list[Camera]:
     return found
 
 
-def part_seen(mesh: Mesh, field: NerfstudioField, cameras: Sequence[Camera]) -> Mesh:
-    """What two cameras see at least of a mesh; all in nerfstudio's coordinates.
+def visible_mesh(mesh: Mesh, field: NerfstudioField, cameras: Sequence[Camera]) -> Mesh:
+    """The part of a mesh that is visible in at least two cameras; all in nerfstudio's coordinates.
 
     Raises:
         NoSurfaceError: nothing of it.
     """
     unit = Similarity((0.0, 0.0, 0.0), 1 / field.scale)
-    points, within = seen_points(field.field, [(camera.moved(unit), None) for camera in cameras])
+    points, within = visible_points(field.field, [(camera.moved(unit), None) for camera in cameras])
     part = None
     if len(points):
         moved = dataclasses.replace(mesh, vertices=mesh.vertices * field.scale)
-        part, _ = seen_part(moved, Support(points.numpy(), within, seen=True))
+        part, _ = visible_part(moved, Support(points.numpy(), within, visible=True))
     if part is None:
         raise NoSurfaceError("no two photographs see any of it; leave out --seen")
     return dataclasses.replace(part, vertices=part.vertices / field.scale)

@@ -21,7 +21,7 @@ from ...neural_fields.networks.neus_mlp import NeusSDF
 from ...neural_fields.volume.render import Rendered, Sampling, render_volume
 from ...neural_fields.volume.weights import sphere_span
 from ..training.settings import ReconstructConfig
-from ..training.trainer import Focus, seeded
+from ..training.trainer import ErrorWeightedSampler, seeded
 
 # Kinds of devices on which matrix products of colours are in bfloat16.
 HALF_PRECISION = ("cuda",)
@@ -278,13 +278,13 @@ class RayPool:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def draw(self, count: int, generator: torch.Generator, focus: Focus | None = None) -> Rays:
-        """``count`` rays at random, with replacement; ``focus`` says where."""
+    def draw(self, count: int, generator: torch.Generator, sampler: ErrorWeightedSampler | None = None) -> Rays:
+        """``count`` rays at random, with replacement; ``sampler`` chooses the pixels."""
 
         def draw() -> Tensor:
-            if focus is None:
+            if sampler is None:
                 return torch.randint(len(self), (count,), generator=generator)
-            return focus.rows(count, generator)
+            return sampler.rows(count, generator)
 
         rows = handed(draw, self.device)
         view, pixel = self.owners[rows].long(), self.pixels[rows].long()

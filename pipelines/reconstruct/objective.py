@@ -17,7 +17,7 @@ from ...neural_fields.networks.grids import ValueGrid, tables_apart
 from ...neural_fields.volume.render import Sampling
 from ..training.replay import CudaGraphs, Recorder, Replays
 from ..training.settings import ReconstructConfig
-from ..training.trainer import Focus, Group, Objective, Trainer, warm_cosine
+from ..training.trainer import ErrorWeightedSampler, Group, Objective, Trainer, warm_cosine
 from .measured import MeasuredDepths, depth_loss
 from .model import RayPool, SceneModel
 
@@ -90,8 +90,8 @@ class SceneObjective(Objective):
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
         # As of late, on the CPU, which reads them: sections of a ray that are evaluated, and the surface's uncertainty.
         self.kept["lately"] = torch.tensor([0.0, 1 / float(model.inv_std.detach())])
-        self.focus = Focus(len(pool), config.focus, pool.device)
-        self.kept |= self.focus.kept
+        self.sampler = ErrorWeightedSampler(len(pool), config.focus, pool.device)
+        self.kept |= self.sampler.kept
         self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
         if self.grid is not None:
             self.kept |= {
@@ -158,7 +158,7 @@ class SceneObjective(Objective):
     def ahead(self, step: int, done: float) -> Kind:
         """Do what a step needs of the host first → the kind of the step."""
         self.done = done
-        self.focus.watched(step, self.kept)
+        self.sampler.at_step(step, self.kept)
         self.look(step, done)
         measured = self.measured
         if measured is not None:
@@ -187,7 +187,7 @@ class SceneObjective(Objective):
         """The losses of a fresh batch; nothing of it depends on the step but by what it is `handed`."""
         config, pool = self.config, self.pool
         self.model.widen(config.band, config.least_delta)
-        rays = pool.draw(kind.rays, self.generator, self.focus)
+        rays = pool.draw(kind.rays, self.generator, self.sampler)
         origins, directions = rays.origins, rays.directions
         if self.model.poses is not None:
             origins, directions = self.model.poses.moved(origins, directions, rays.view)
@@ -208,7 +208,7 @@ class SceneObjective(Objective):
         if pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
         wrong = (self.model.photographed(seen, rays.view) - target).abs().mean(dim=1)
-        self.focus.learn(rays.row, wrong.detach())
+        self.sampler.learn(rays.row, wrong.detach())
         color = wrong.mean()
         # A mean over all sections within the region, those that were skipped included: some stand for the others.
         within = (seen.counts > 0).any(dim=1).sum().to(wrong).clamp(min=1) * seen.counts.shape[1]

@@ -34,7 +34,7 @@ from .measured import MeasuredDepths
 from .model import RayPool, SceneModel, build_scene
 from .objective import ReplayedTrainer, scene_trainer
 from .views import (
-    SeenFrom,
+    MaskedCamera,
     ViewImage,
     comparison_sheet,
     exposed_as,
@@ -42,8 +42,8 @@ from .views import (
     measure,
     reduced,
     render_image,
-    seen_points,
     spread,
+    visible_points,
 )
 
 HELD_OUT_FILE = "held_out.png"
@@ -71,7 +71,7 @@ class FinishOptions:
     timed_pixels: int = 1024  # of the picture by which its time is estimated
     timed_resolution: int = 32  # of the mesh by which the time of meshes is estimated, whose cost grows with its square
     mesh_resolution: int = 256  # of the mesh that the command makes of a finished run
-    traced_views: int = 30  # views whose cost `seen_points` does not exceed
+    traced_views: int = 30  # views whose cost `visible_points` does not exceed
     texture_factor: float = 2.0  # time of the texture, surface and samples included, over that of its steps
 
 
@@ -210,9 +210,9 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         return seconds
 
     def surface_seconds(self) -> float:
-        """Seconds for what photographs see of the surface, and for its meshes, from one view and a coarse mesh."""
+        """Seconds for the visibility test and for the meshes, measured on one view and a coarse mesh."""
         started = time.monotonic()
-        seen_points(self.model.geometry, self._sights()[:1])
+        visible_points(self.model.geometry, self._masked_cameras()[:1])
         traced = time.monotonic()
         with suppress(NoSurfaceError):
             extract_mesh(self.model.geometry, resolution=FINISH.timed_resolution)
@@ -221,7 +221,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         views = min(len(self.train_views), FINISH.traced_views)
         return (traced - started) * views + meshed * cells / FINISH.timed_resolution**2
 
-    def _sights(self) -> list[SeenFrom]:
+    def _masked_cameras(self) -> list[MaskedCamera]:
         """The cameras that were trained on, in unit-sphere coordinates, and their masks."""
         return [(view.camera.moved(self.similarity), view.mask) for view in self.train_views]
 
@@ -246,9 +246,9 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         pairs = self._render_held_out()
         record = self.record(finished=True) | {"held_out": self._figures(pairs)}
         with reported(self.report, "what photographs see"):
-            points, within = seen_points(self.model.geometry, self._sights())
+            points, within = visible_points(self.model.geometry, self._masked_cameras())
             if len(points):
-                self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), seen_within=within))
+                self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), visible_within=within))
         self.model.cpu()
         texture, record["texture"] = self._texture()
         out = self.folder.out

@@ -168,16 +168,16 @@ def _enlarged(picture: Image, least: int = 600) -> Image:
     return picture.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
-SeenFrom = tuple[Camera, NDArray[np.float32] | None]
-"""A camera in unit-sphere coordinates, and the mask ``(H, W)`` of its picture, which says what is object."""
+MaskedCamera = tuple[Camera, NDArray[np.float32] | None]
+"""A camera in unit-sphere coordinates, and the mask ``(H, W)`` of the object in its picture."""
 
 
 @torch.no_grad()
-def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]:
-    """Points ``(N, 3)`` of the surface that two photographs see at least, on the CPU, and the distance of neighbours.
+def visible_points(field: Field, views: Sequence[MaskedCamera]) -> tuple[Tensor, float]:
+    """Points ``(N, 3)`` of the surface visible in at least two views, on the CPU, and the distance of neighbours.
 
-    Every view is traced in up to 10,000 pixels of what its mask calls object, and all together in 300,000. Places are
-    told apart that are 1/32 of a radius apart, or as far as neighbouring pixels on a surface that is seen obliquely.
+    Each view is traced in up to 10,000 pixels inside its mask, and all views together in up to 300,000. Points in one
+    voxel count as one. Its edge is 1/32 of a radius, or the distance of neighbouring pixels on an oblique surface.
     ``views`` are cameras in the field's unit-sphere coordinates, and masks if there are any.
     """
     pixels = max(1, min(300_000 // len(views), 10_000))
@@ -204,10 +204,10 @@ def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]
     cells = ((every + 1) / max(1 / 32, within)).floor().long()
     across = 1 + int(cells.max())
     place = (cells[:, 0] * across + cells[:, 1]) * across + cells[:, 2]
-    # A view counts once in a place, however many of its pixels see it.
+    # A view counts once in a place, for any number of its pixels.
     pairs = torch.unique(place * len(views) + torch.cat(owners))
     known, count = torch.unique(pairs // len(views), return_counts=True)
-    # What one view alone sees, it cannot measure.
+    # A single view does not determine depth.
     return every[torch.isin(place, known[count >= min(2, len(views))])], within
 
 

@@ -159,9 +159,9 @@ def evaluate_surfaces(
         again = _ways(sample_points(reference, samples, of_floor)[0], target)
         floor = float(again.there.mean() + again.back.mean())
         if view_counts is not None:
-            seen = view_counts(given, similarity.to_input(target)) >= 2
+            is_visible = view_counts(given, similarity.to_input(target)) >= 2
             ways = (_Ways(forward**2, np.asarray(nearest), backward**2), again)
-            visible = Visible(float(seen.mean()), *(_chamfer_where(seen, way) for way in ways))
+            visible = Visible(float(is_visible.mean()), *(_chamfer_where(is_visible, way) for way in ways))
         iou, iou_notes = _iou(mesh, reference, columns, closed=closed)
         notes.extend(iou_notes)
     precision, recall = float((forward < threshold).mean()), float((backward < threshold).mean())
@@ -212,8 +212,8 @@ def _ways(a: Float64, b: Float64) -> _Ways:
     return _Ways(np.asarray(forward) ** 2, np.asarray(nearest), np.asarray(backward) ** 2)
 
 
-def _chamfer_where(seen: NDArray[np.bool_], ways: _Ways) -> float | None:
-    there, back = ways.there[seen[ways.nearest]], ways.back[seen]
+def _chamfer_where(visible: NDArray[np.bool_], ways: _Ways) -> float | None:
+    there, back = ways.there[visible[ways.nearest]], ways.back[visible]
     return float(there.mean() + back.mean()) if len(there) and len(back) else None
 
 

@@ -205,9 +205,9 @@ def drop_unsupported(
         used = np.unique(mesh.faces)
         near, whose = KDTree(mesh.vertices[used]).query(points, distance_upper_bound=reach, workers=-1)
         own = np.bincount(of_vertex[used[np.asarray(whose)[np.isfinite(near)]]], minlength=len(whole))
-        usual = whole / max(spacing_of(np.asarray(points, np.float64)), 1e-300) ** 2
+        expected = whole / max(spacing_of(np.asarray(points, np.float64)), 1e-300) ** 2
         # Around one or two strays a fit may close a bubble as small as their spacing.
-        kept &= own >= np.minimum(3, usual / 2)
+        kept &= own >= np.minimum(3, expected / 2)
     if kept.all() or not kept.any():
         return Supported(mesh, 0, 0.0)
     return Supported(keep_faces(mesh, kept[number]), int((~kept).sum()), float(whole[~kept].sum() / whole.sum()))
@@ -270,28 +270,30 @@ def trim_distance(mesh: Mesh, points: NDArray[np.floating], distance: float) -> 
 
 
 class Support(NamedTuple):
-    """What a surface rests on: points ``(N, 3)`` in the unit sphere, and how near some of them it passes.
+    """Points ``(N, 3)`` of the unit sphere that support a surface, and how near some of them it passes.
 
-    ``seen``: they are all that photographs have seen, so that what is further off was seen by none.
+    ``visible``: the points are those visible in the training views, so that parts further away are unobserved.
     """
 
     points: NDArray[np.float64]
     radius: float
-    seen: bool = False
+    visible: bool = False
 
 
-def thinned(points: NDArray[np.floating], *, seen_within: float | None = None) -> dict[str, Tensor]:
-    """What `SUPPORT_FILE` keeps of unit-sphere points ``(N, 3)``, of a fit or seen by photographs: one per voxel.
+def thinned(points: NDArray[np.floating], *, visible_within: float | None = None) -> dict[str, Tensor]:
+    """The tensors of `SUPPORT_FILE` for unit-sphere points ``(N, 3)``, of a fit or visible in views: one per voxel.
 
-    ``seen_within``: of what photographs see, how far from some point that may be.
+    ``visible_within``: distance from some point up to which the surface counts as visible.
     """
     kept = points[voxel_representatives(np.asarray(points, np.float64), SUPPORT_VOXEL)]
-    seen = {} if seen_within is None else {"seen_within": torch.tensor(float(np.hypot(seen_within, SUPPORT_VOXEL)))}
-    return {"points": torch.from_numpy(kept).half(), **seen}
+    tensors = {"points": torch.from_numpy(kept).half()}
+    if visible_within is not None:
+        tensors["seen_within"] = torch.tensor(float(np.hypot(visible_within, SUPPORT_VOXEL)))
+    return tensors
 
 
-def seen_part(mesh: Mesh, support: Support) -> tuple[Mesh | None, float]:
-    """The faces of a mesh that photographs have seen, and the share of its area that they have not; None of none."""
+def visible_part(mesh: Mesh, support: Support) -> tuple[Mesh | None, float]:
+    """The faces visible in the training views, or None without any, and the share of area that is not visible."""
     near = KDTree(support.points).query(mesh.vertices, distance_upper_bound=support.radius, workers=-1)[0]
     kept = np.isfinite(near)[mesh.faces].all(axis=1)
     areas = face_normals(mesh)[1]
@@ -299,7 +301,7 @@ def seen_part(mesh: Mesh, support: Support) -> tuple[Mesh | None, float]:
 
 
 def read_support(field: Path, record: dict[str, Any], level: int) -> Support | None:
-    """What supports a level of the field in a file; None if it is no run's, or that level is still in training.
+    """The support of a level of the field in a file; None if it is no run's, or that level is still in training.
 
     ``record`` is what ``run.json`` holds. Raises an InputError if the points are damaged or of another run.
     """
@@ -317,6 +319,6 @@ def read_support(field: Path, record: dict[str, Any], level: int) -> Support | N
     if photographed:
         if "seen_within" not in tensors or not 0 < float(tensors["seen_within"]) < np.inf:
             raise InputError(f"{path}: damaged (no length); remove it, or reconstruct again")
-        return Support(points, float(tensors["seen_within"]), seen=True) if len(points) else None
+        return Support(points, float(tensors["seen_within"]), visible=True) if len(points) else None
     error = stages[level]["rms_at_points"] / record["similarity"]["scale"]
     return Support(points, support_radius(points, error=error))

@@ -348,7 +348,7 @@ def texture_run(
         config = config or TextureConfig()
         geometry, similarity, _ = load_field(file)
         if geometry.in_dim == 4:
-            geometry = moment(geometry, 0.0)  # from there, colours ride along
+            geometry = moment(geometry, 0.0)  # colours are transported from there
         trained_level = chosen_level(geometry, file, level)
         cloud = read_colors(source, samples=config.samples, seed=config.seed, columns=config.columns)
         fingerprint = _fingerprint(cloud, geometry)

@@ -153,9 +153,9 @@ class TransportedPoints:
         try:
             displacement = flow(self._velocity, vertices, time, to, solver=_solver(TRANSPORT.step)) - vertices
         except IntegrationError as error:
-            raise InputError(f"colours cannot ride along to time {time:.3g} ({error}); leave them out") from error
-        between = _Between(mesh.vertices, displacement.double().cpu().numpy())
-        return lambda points: points + torch.from_numpy(between(points.double().cpu().numpy())).to(points)
+            raise InputError(f"colours cannot be transported to time {time:.3g} ({error}); leave them out") from error
+        interpolation = _Interpolation(mesh.vertices, displacement.double().cpu().numpy())
+        return lambda points: points + torch.from_numpy(interpolation(points.double().cpu().numpy())).to(points)
 
     @cached_property
     def _velocity(self) -> CarriedVelocity:
@@ -243,8 +243,8 @@ def texture_colors(texture: TextureField, placed: Similarity | None = None) -> C
     return colors
 
 
-class _Between:
-    """Displacements between the points ``(V, 3)`` at which they are known: weighted affine least squares."""
+class _Interpolation:
+    """Displacements interpolated from those of points ``(V, 3)``, by weighted affine least squares."""
 
     def __init__(self, points: NDArray[np.floating], displacement: NDArray[np.float64]) -> None:
         self._tree, self._points, self._displacement = KDTree(points), np.asarray(points, np.float64), displacement

@@ -304,13 +304,13 @@ def without_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tens
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
-class Focus:
-    """Draws pixels of a pool evenly or by the errors of their strips, running means that begin with 1.
+class ErrorWeightedSampler:
+    """Draws pixels of a pool uniformly, or in proportion to the mean error of their strip of neighbours.
 
-    The chance of a pixel, one of the n in a strip with the error e, is ``(1 - share) / N + share · e / (n Σ e)`` of N
-    pixels: what few photographs show is learnt late from even samples. With ``share`` below one no pixel is forgotten,
-    and one that is always wrong has not all. A ``strip`` is a number of neighbours on a line; 1 for samples that are
-    no neighbours.
+    Of N pixels, one of the n in a strip with the error e has the probability ``(1 - share) / N + share · e / (n Σ e)``.
+    Uniform samples alone learn late what few photographs show. A ``share`` below 1 leaves every pixel some probability.
+    Errors are running means that begin with 1. A ``strip`` is a number of neighbouring pixels on a line; it is 1 for
+    samples that are no neighbours.
     """
 
     def __init__(self, pixels: int, share: float, device: torch.device, *, strip: int = 16) -> None:
@@ -320,11 +320,11 @@ class Focus:
 
     @property
     def kept(self) -> Mapping[str, Tensor]:
-        """What later steps depend on, for `Objective.kept`."""
+        """State of the sampler, for `Objective.kept`."""
         return {"errors": self.errors, "bounds": self.bounds}
 
-    def watched(self, step: int, kept: MutableMapping[str, Tensor]) -> Focus:
-        """This one at a step of a training, with the objective's ``kept``; refreshed every 16 steps."""
+    def at_step(self, step: int, kept: MutableMapping[str, Tensor]) -> ErrorWeightedSampler:
+        """The sampler with the state in an objective's ``kept``, refreshed every 16 steps."""
         self.errors, self.bounds = kept["errors"], kept["bounds"]
         if step % 16 == 0:
             self.refresh()
@@ -332,7 +332,7 @@ class Focus:
         return self
 
     def refresh(self) -> None:
-        """Draw by the errors as they are now; a GPU is waited for."""
+        """Update the probabilities to the current errors; the host waits for a GPU."""
         self.bounds = self.errors.double().cumsum(0).cpu()
 
     def rows(self, count: int, generator: torch.Generator) -> Tensor:

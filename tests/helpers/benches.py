@@ -3,8 +3,8 @@
 from mplicits.neural_fields import Similarity, Sphere
 from mplicits.pipelines.training.settings import FitConfig
 
-from benchmarks.harness.cells import Findings, Method
-from benchmarks.paper.cells import PaperCell
+from benchmarks.harness.jobs import Method, Results
+from benchmarks.paper.jobs import PaperJob
 from benchmarks.paper.judge import Judge
 
 SMALL = FitConfig(
@@ -14,7 +14,7 @@ SMALL = FitConfig(
 RADIUS, PLACE = 0.7, Similarity((5.0, 0.0, -1.0), 20.0)  # of the ball
 
 
-class Exact(Method[PaperCell]):
+class Exact(Method[PaperJob]):
     """Knows the ball, or one of another radius; fails where that is None."""
 
     source, differs = "a test", "nothing"
@@ -22,10 +22,10 @@ class Exact(Method[PaperCell]):
     def __init__(self, name: str = "exact", radius: float | None = RADIUS, *, title: str = "Exact") -> None:
         self.name, self.radius, self.title, self.runs = name, radius, title, 0
 
-    def run(self, cell, work):
+    def run(self, job, context):
         self.runs += 1
         if self.radius is None:
             raise RuntimeError("no\nluck")
         field = Sphere(radius=self.radius)
-        figures = Judge(cell, work).field(self.title, field, PLACE, parameters=1, train_seconds=2.0)
-        return Findings((figures,), (0.25,))
+        figures = Judge(job, context).field(self.title, field, PLACE, parameters=1, train_seconds=2.0)
+        return Results((figures,), (0.25,))

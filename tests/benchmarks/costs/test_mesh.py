@@ -44,4 +44,4 @@ def test_a_missing_peer_is_an_input_error_before_any_work(tmp_path, monkeypatch)
     for name in ("skimage", "skimage.measure"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(InputError, match=r"scikit-image's; pip install 'mplicits\[bench\]'"):
-        MeshBench(run_file=tmp_path / "ball.safetensors").cells()
+        MeshBench(run_file=tmp_path / "ball.safetensors").jobs()

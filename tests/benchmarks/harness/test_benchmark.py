@@ -1,4 +1,4 @@
-"""What every benchmark of ours shares: rows to JSON and back, finished cells that are kept, tables in three forms."""
+"""What every benchmark of ours shares: rows to JSON and back, finished jobs that are kept, tables in three forms."""
 
 import csv
 import dataclasses
@@ -13,9 +13,9 @@ from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Progress
 
 from benchmarks.harness.benchmark import Benchmark, Part, from_figures, write_results
-from benchmarks.harness.cells import Catalogue
+from benchmarks.harness.jobs import Registry
 from benchmarks.harness.report import as_text
-from benchmarks.harness.run import run_cell, run_cells
+from benchmarks.harness.run import run_job, run_pending
 from benchmarks.harness.tables import Column, Table, tabulated
 
 
@@ -46,20 +46,20 @@ class Squares(Benchmark[Row]):
     config: FitConfig = dataclasses.field(default_factory=FitConfig)
     done: list[str] = dataclasses.field(default_factory=list, compare=False)
 
-    def settings(self, cell):
-        return {k: v for k, v in super().settings(cell).items() if k != "done"}
+    def settings(self, job):
+        return {k: v for k, v in super().settings(job).items() if k != "done"}
 
-    def cells(self):
+    def jobs(self):
         return [Part(self.name, f"edge {edge:g}", options=(("edge", edge),)) for edge in self.edges]
 
-    def measure(self, cell, work):
-        edge = cell.parameters["edge"]
+    def measure(self, job, context):
+        edge = job.parameters["edge"]
         if edge < 0:
             raise InputError("no such square")
-        self.done.append(cell.name)
-        work.say(f"drawing {cell.name}")
-        work.stage("square")(Progress("drawn", 1, 1, 1.0, {}))
-        return [Row(cell.name, Size(edge, (1, 2)) if edge else None, (0.5,))]
+        self.done.append(job.name)
+        context.say(f"drawing {job.name}")
+        context.stage("square")(Progress("drawn", 1, 1, 1.0, {}))
+        return [Row(job.name, Size(edge, (1, 2)) if edge else None, (0.5,))]
 
     def tables(self, rows, *, sgemm) -> tuple[Table, ...]:
         figures = [(Column("area", ".1f", "lowest"), lambda row: row.area)]
@@ -75,7 +75,7 @@ def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
     assert stages == ["square drawn"] * 2
     assert bench.rows(tmp_path) == rows
     assert len(bench.done) == 2
-    record = run_cell(bench.cells()[0], tmp_path, Catalogue([bench]))
+    record = run_job(bench.jobs()[0], tmp_path, Registry([bench]))
     size = {"edge": 2.0, "corners": [1, 2]}
     assert record["outputs"] == [{"name": "edge 2", "size": size, "times": [0.5], "area": 4.0}]
     assert record["cell"] == {"method": "squares", "name": "edge 2", "files": [], "edge": 2.0}
@@ -84,10 +84,10 @@ def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
 
 def test_keys_are_of_settings_but_not_of_other_cells_and_devices() -> None:
     bench = Squares(edges=[2.0])
-    (part,) = bench.cells()
+    (part,) = bench.jobs()
 
     def key(**changes: object) -> str:
-        return Catalogue([dataclasses.replace(bench, **changes)]).key(part)  # type: ignore[arg-type]
+        return Registry([dataclasses.replace(bench, **changes)]).key(part)  # type: ignore[arg-type]
 
     assert key() == key(edges=[2.0, 3.0]) == key(config=FitConfig(device="cpu"))
     assert key() != key(config=FitConfig(seed=1))
@@ -99,13 +99,13 @@ def test_results_of_what_is_done(tmp_path: Path) -> None:
     bench = Squares(edges=[2.0, -1.0, 1.0])
     lines: list[str] = []
     (tmp_path / "cells").mkdir()
-    ran = run_cells(bench.cells(), tmp_path, Catalogue([bench]), say=lines.append)
+    ran = run_pending(bench.jobs(), tmp_path, Registry([bench]), say=lines.append)
     assert [part.name for part in ran.records] == ["edge 2", "edge 1"]
     assert "edge -1: failed: no such square" in lines[1]
     with pytest.raises(InputError, match="no such square"):
         bench.rows(tmp_path)
     other = Squares(edges=[7.0])
-    planned = [(bench, bench.cells()), (other, other.cells())]
+    planned = [(bench, bench.jobs()), (other, other.jobs())]
     tables, figures = write_results(planned, tmp_path, command="python -m benchmarks squares")
     (table,) = tables
     written = json.loads((tmp_path / "results.json").read_text())

@@ -12,9 +12,9 @@ from benchmarks.paper.comparison import banf_tables, comparison_tables, noise_pl
 from benchmarks.paper.published import BANF, COMPARISON, NOISE
 
 
-def record(shape, method, chamfers, *, iou=0.9, deltas=(), **cell):
+def record(shape, method, chamfers, *, iou=0.9, deltas=(), **job):
     """One whose outputs are named after their Chamfer distances' keys."""
-    fields = {"noise": 0.0, "outliers": 0.0, "flipped": 0.0, "overrides": {}, "preset": "smoke", "seed": 0} | cell
+    fields = {"noise": 0.0, "outliers": 0.0, "flipped": 0.0, "overrides": {}, "preset": "smoke", "seed": 0} | job
     found = {"chamfer_floor": 1e-6, "iou": iou, "shell_iou": iou / 2, "components": 3, "rays_per_second": 4 * 512**2}
     outputs = []
     for name, value in chamfers.items():

@@ -1,4 +1,4 @@
-"""The paper's ablations: exact distances, variants that are what they say, rows from made-up records, smoke cells."""
+"""The paper's ablations: exact distances, variants that are what they say, rows from made-up records, smoke jobs."""
 
 import dataclasses
 import math
@@ -17,13 +17,13 @@ from mplicits.pipelines.fit.samples import banded_sources
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.surface.distance import MeshDistance
 
-from benchmarks.harness.cells import make_folder
-from benchmarks.harness.run import run_cell
+from benchmarks.harness.jobs import make_folder
+from benchmarks.harness.run import run_job
 from benchmarks.paper import base as training
 from benchmarks.paper.ablations import DELTA_FACTOR, LOSS_WEIGHTS
 from benchmarks.paper.isolation import ISOLATION, IndependentLevels, isolation_tables, residuals_everywhere, steepness
 from benchmarks.paper.judge import fit_config
-from benchmarks.paper.methods import CATALOGUE
+from benchmarks.paper.methods import REGISTRY
 from benchmarks.paper.sheets import write_sheets
 from benchmarks.paper.speed import MARCHING_CUBES, NORMALS, grid_seconds
 from benchmarks.shapes.sampled_error import approximation_error, near_surface
@@ -172,8 +172,8 @@ def test_grid_seconds_count_what_was_left_out() -> None:
 
 
 def record(method: str, outputs: list[dict[str, Any]], *, shape: str = "ball", **more: Any) -> dict[str, Any]:
-    cell = {"shape": shape, "method": method, "preset": "cpu", "noise": 0.0, "overrides": {}} | more.pop("cell", {})
-    return {"cell": cell, "outputs": outputs, "deltas": [], "details": {}, "environment": {"device": "cpu"}} | more
+    job = {"shape": shape, "method": method, "preset": "cpu", "noise": 0.0, "overrides": {}} | more.pop("job", {})
+    return {"cell": job, "outputs": outputs, "deltas": [], "details": {}, "environment": {"device": "cpu"}} | more
 
 
 def test_isolation_rows_are_means_over_shapes_beside_the_papers() -> None:
@@ -183,13 +183,13 @@ def test_isolation_rows_are_means_over_shapes_beside_the_papers() -> None:
 
     noisy = {"noise": 0.01}
     records = [
-        record("ours", [figures("Ours coarse", 9.0, 9), figures("Ours fine", 9.0, 9)], cell=noisy),
-        record("isolation", [figures("a", 1.0, 1), figures("a without culling", 1.5, 1)], cell=noisy),
-        record("isolation", [figures("a", 3.0, 3)], shape="cube", cell=noisy),
+        record("ours", [figures("Ours coarse", 9.0, 9), figures("Ours fine", 9.0, 9)], job=noisy),
+        record("isolation", [figures("a", 1.0, 1), figures("a without culling", 1.5, 1)], job=noisy),
+        record("isolation", [figures("a", 3.0, 3)], shape="cube", job=noisy),
         record("isolation", [figures("a", 0.25, 1)]),
-        record("isolation", [figures("b", 4.0, 2)], cell=noisy),
-        record("isolation", [figures("b", None, 0)], shape="cube", cell=noisy),
-        record("isolation", [figures("c", 5.0, 2), figures("c without culling", 50.0, 1234)], cell=noisy),
+        record("isolation", [figures("b", 4.0, 2)], job=noisy),
+        record("isolation", [figures("b", None, 0)], shape="cube", job=noisy),
+        record("isolation", [figures("c", 5.0, 2), figures("c without culling", 50.0, 1234)], job=noisy),
     ]
     table, culling = isolation_tables(records)
     assert table.rows[0].values == pytest.approx((2.0, 2.0, 4.0, 0.5, 0.9, 2.0, 0.25, 0.25, 0.5, 0.5, 0.9, 1.0))
@@ -219,9 +219,9 @@ LONG = [pytest.param(spec, marks=pytest.mark.slow) for spec in (LOSS_WEIGHTS, DE
 
 @pytest.mark.parametrize("spec", [*LONG, NORMALS], ids=lambda s: s.name)
 def test_smoke(spec: Any, ball: Path, out: Path) -> None:
-    planned = [cell for cell in spec.cells([ball], "smoke") if spec is ISOLATION or not cell.noise]
-    cells = [cell for cell in planned if dict(cell.overrides).get("constraint", "sdf") == "sdf"]
-    records = [run_cell(cell, out, CATALOGUE) for cell in cells]
+    planned = [job for job in spec.jobs([ball], "smoke") if spec is ISOLATION or not job.noise]
+    jobs = [job for job in planned if dict(job.overrides).get("constraint", "sdf") == "sdf"]
+    records = [run_job(job, out, REGISTRY) for job in jobs]
     tables = spec.tables(records)
     assert tables
     assert all("paper only" in row.name or any(v is not None for v in row.values) for row in tables[0].rows)
@@ -229,8 +229,8 @@ def test_smoke(spec: Any, ball: Path, out: Path) -> None:
         chamfers = [row.values[6] for row in tables[0].rows]
         assert all(isinstance(c, float) and c < 0.01 for c in chamfers)
         assert all(row.values[0] is not None for row in tables[1].rows)  # with and without culling
-        sheets = write_sheets("isolation", dict(zip(cells, records, strict=True)), out)
+        sheets = write_sheets("isolation", dict(zip(jobs, records, strict=True)), out)
         assert [title for _, title in sheets] == ["isolation: ball", "isolation: ball + noise 0.01"]
         clean, noisy = (imread(out / file).shape for file, _ in sheets)
         assert noisy[0] > clean[0]  # a row more: what culling hides
-    assert [run_cell(cell, out, CATALOGUE) for cell in cells] == records
+    assert [run_job(job, out, REGISTRY) for job in jobs] == records

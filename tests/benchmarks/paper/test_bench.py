@@ -11,7 +11,7 @@ from benches import RADIUS, Exact
 from evolutions import fails
 
 from benchmarks.cli import main
-from benchmarks.harness.cells import Catalogue
+from benchmarks.harness.jobs import Registry
 from benchmarks.paper import bench, names
 
 
@@ -20,7 +20,7 @@ def exact(monkeypatch: pytest.MonkeyPatch) -> dict[str, Exact]:
     """The methods of the paper by their names; IDF fails."""
     titles = {"ours": "Ours fine", "siren": "SIREN"}
     methods = [Exact(name, None if name == "idf" else RADIUS, title=titles.get(name, name)) for name in names.METHODS]
-    monkeypatch.setattr(bench, "CATALOGUE", Catalogue(methods))
+    monkeypatch.setattr(bench, "REGISTRY", Registry(methods))
     monkeypatch.setattr(bench, "sgemm_rate", lambda *_, **__: 1e9)
     return {method.name: method for method in methods}
 
@@ -50,7 +50,7 @@ def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixtur
     for link in ("sheets/comparison-ball.jpg", "plots/comparison-per-mesh-all.svg"):
         assert f"]({link})" in page
 
-    # Another table shares the cell; the page keeps the first, and a third run does nothing.
+    # Another table shares the job; the page keeps the first, and a third run does nothing.
     assert main([*command, "--table", "deltas"]) == 0
     assert runs(exact) == 3
     page = (out / "results.md").read_text()
@@ -85,7 +85,7 @@ def test_ctrl_c(ball: Path, tmp_path: Path, exact, monkeypatch, capsys: pytest.C
 
     monkeypatch.setattr(Exact, "run", stop)
     assert main(f"paper {ball} -o {tmp_path} --preset smoke".split()) == 130
-    assert "goes on after the last finished cell" in capsys.readouterr().err
+    assert "goes on after the last finished job" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

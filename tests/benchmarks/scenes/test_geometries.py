@@ -11,8 +11,8 @@ from mplicits.pipelines.training.trainer import parameter_count
 from reconstructions import small_reconstructions
 
 from benchmarks.cli.scenes import GEOMETRIES as OFFERED
-from benchmarks.harness.cells import Catalogue, Workplace, make_folder
-from benchmarks.harness.run import run_cells
+from benchmarks.harness.jobs import Context, Registry, make_folder
+from benchmarks.harness.run import run_pending
 from benchmarks.scenes import geometries
 from benchmarks.scenes.geometries import GEOMETRIES, SINGLE, GeometryBench, best_trainings
 from benchmarks.scenes.reconstruct import read_scene
@@ -67,13 +67,13 @@ def test_colours_begin_alike_and_learn_at_one_rate(bench):
 def test_the_choice_of_geometries_changes_no_key(bench):
     assert set(OFFERED) == set(GEOMETRIES)
     some = dataclasses.replace(bench, geometries=(NEUS, MULTISCALE))
-    chosen = [cell for cell in bench.cells() if cell.parameters["geometry"] != SINGLE]
-    keys, before = ({Catalogue([one]).key(cell) for cell in chosen} for one in (some, bench))
-    assert {Catalogue([some]).key(cell) for cell in some.cells()} == keys == before
+    chosen = [job for job in bench.jobs() if job.parameters["geometry"] != SINGLE]
+    keys, before = ({Registry([one]).key(job) for job in chosen} for one in (some, bench))
+    assert {Registry([some]).key(job) for job in some.jobs()} == keys == before
 
 
 def test_the_best_rate_of_each_counts_and_gains_are_paired(bench, tmp_path, monkeypatch):
-    first = bench.run(bench.cells()[0], Workplace(tmp_path, "one"))
+    first = bench.run(bench.jobs()[0], Context(tmp_path, "one"))
     row = bench.read([{"outputs": list(first.outputs)}])[0]
     assert (row.geometry, row.rate, row.seed, row.result.steps) == (MULTISCALE, 3e-4, 0, 2)
 
@@ -120,11 +120,11 @@ def test_several_trainings_at_a_time_find_what_one_after_the_other_does(bench, t
     for streams in (1, 2):
         some = dataclasses.replace(bench, geometries=(NEUS,), streams=streams)
         make_folder(tmp_path / str(streams))
-        cells, out = some.cells(), tmp_path / str(streams)
-        ran = run_cells(cells, out, Catalogue([some]), streams=streams, say=lambda _: None)
-        assert (list(ran.records), ran.failures) == (cells, {})
+        jobs, out = some.jobs(), tmp_path / str(streams)
+        ran = run_pending(jobs, out, Registry([some]), streams=streams, say=lambda _: None)
+        assert (list(ran.records), ran.failures) == (jobs, {})
         rows = some.read(list(ran.records.values()))
         tables.append([(row.geometry, row.rate, row.seed, row.result.psnr, row.result.surface) for row in rows])
     assert tables[0] == tables[1]
-    # A cell for each rate, the second seed's, and that under its own rate, each done once.
+    # A job for each rate, the second seed's, and that under its own rate, each done once.
     assert len(list((tmp_path / "2" / "cells").iterdir())) == 2 + 1 + 1

@@ -20,7 +20,7 @@ from reconstructions import small_reconstructions
 from refusals import refused
 
 from benchmarks.cli import main
-from benchmarks.harness.cells import Catalogue, record_file
+from benchmarks.harness.jobs import Registry, record_file
 from benchmarks.harness.report import as_text
 from benchmarks.scenes import flops
 from benchmarks.scenes import reconstruct as module
@@ -117,8 +117,8 @@ def bench(scene, tmp_path_factory) -> tuple[Path, ReconstructBench, list[Reconst
     drawn: list[torch.Tensor] = []
     draw = RayPool.draw
 
-    def spy(self, count, generator, focus=None):
-        rays = draw(self, count, generator, focus)
+    def spy(self, count, generator, sampler=None):
+        rays = draw(self, count, generator, sampler)
         drawn.append(rays.directions)
         return rays
 
@@ -189,7 +189,7 @@ def test_surfaces_are_held_against_the_exact_one(bench):
 
 def test_finished_rows_are_used_again(bench):
     out, ours, rows, _ = bench
-    files = {part.parameters["kind"]: record_file(out, Catalogue([ours]).key(part)) for part in ours.cells()}
+    files = {part.parameters["kind"]: record_file(out, Registry([ours]).key(part)) for part in ours.jobs()}
     before = {kind: file.stat().st_mtime_ns for kind, file in files.items()}
     assert ours.rows(out) == rows
     assert {kind: file.stat().st_mtime_ns for kind, file in files.items()} == before
@@ -205,7 +205,7 @@ def test_finished_rows_are_used_again(bench):
 def test_rows_of_other_settings_are_other_rows(bench, scene):
     ours = bench[1]
     repainted = dataclasses.replace(scene, images=render_scene(SCENES["painted-sphere"](), 6, 8, seed=1))
-    keys = {Catalogue([ours]).key(part) for part in ours.cells()}
+    keys = {Registry([ours]).key(part) for part in ours.jobs()}
     for other, apart in (
         (dataclasses.replace(ours, config=dataclasses.replace(TINY, steps=5)), 3),
         (dataclasses.replace(ours, scenes=[repainted]), 3),
@@ -213,7 +213,7 @@ def test_rows_of_other_settings_are_other_rows(bench, scene):
         (dataclasses.replace(ours, neus_learning_rate=1e-3), 1),
         (dataclasses.replace(ours, config=dataclasses.replace(TINY, texture_steps=5)), 0),
     ):
-        assert len({Catalogue([other]).key(part) for part in other.cells()} - keys) == apart
+        assert len({Registry([other]).key(part) for part in other.jobs()} - keys) == apart
 
 
 def test_what_cannot_be_measured_is_refused(scene, tmp_path):

@@ -165,11 +165,11 @@ def test_what_is_there_is_used_and_what_is_not_is_trained(bench, tmp_path):
     changed = [file for file, then in zip(files, before, strict=True) if file.stat().st_mtime_ns != then]
     assert changed == [coarse / "texture.safetensors"]
     # Other settings, or an image of another mesh beside the same OBJ file, are other fits.
-    part = of(path).cells()[0]
+    part = of(path).jobs()[0]
     assert of(path).settings(part) != of(path, coarse=FULL).settings(part)
     painted = write_ball(tmp_path, image=np.full((4, 4, 3), 0.5))
     assert painted.read_bytes() == path.read_bytes()
-    assert of(painted).cells()[0].options != part.options
+    assert of(painted).jobs()[0].options != part.options
 
 
 def test_the_command(tmp_path, capsys, monkeypatch):

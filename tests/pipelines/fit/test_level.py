@@ -13,7 +13,7 @@ from mplicits.datasets import PointCloud, sample_sphere
 from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.fit import describe
 from mplicits.pipelines.fit.level import JUDGE, Error, Fall, Judge, LevelObjective, Verdict, held_out, standard_errors
-from mplicits.pipelines.fit.samples import Samples, Source, Usual, with_previous
+from mplicits.pipelines.fit.samples import RobustScales, Samples, Source, with_previous
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.trainer import Group, Trainer
 
@@ -87,7 +87,7 @@ def test_the_angle_at_held_out_points_is_their_mean() -> None:
 
 def test_large_errors_count_as_the_level_counts_them() -> None:
     x = points(1000)
-    terms = {"data": 100.0, "normal": 3.0, "usual": Usual(data=1e-5, normal=1e-3)}
+    terms = {"data": 100.0, "normal": 3.0, "scales": RobustScales(data=1e-5, normal=1e-3)}
     judge = Judge(x, -x / RADIUS, Sphere(radius=RADIUS - OFF), 0.1, spacing=SPACING, **terms)
     turned, away = 1e-3 * ((1 + 4 / 1e-3) ** 0.5 - 1), 1e-5 * ((1 + 2 * OFF**2 / 1e-5) ** 0.5 - 1)  # 1 − cos = 2
     assert judge.before.loss == pytest.approx(3 * turned + 100 * away, rel=1e-4)

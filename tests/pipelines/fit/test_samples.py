@@ -74,10 +74,10 @@ def test_beside_the_rim_of_a_hole_discs_that_agree_go_on_where_the_surface_ends(
     # Not of points that fill a sparse cloud in, which may go on beyond an edge.
     assert (sphere_below(0.0, 40_000, given=1).signed(beside) > 0).all()
     # Beyond the rim's reach, and where its discs are seen edge-on, nothing is better than winding numbers.
-    remote = torch.tensor([[0.1, 0.0, 0.05], [0.0, 0.5, -0.05]]) * RADIUS
+    distant = torch.tensor([[0.1, 0.0, 0.05], [0.0, 0.5, -0.05]]) * RADIUS
     turn = torch.linspace(0, 2 * np.pi, 50)
     edge_on = RADIUS * torch.stack((0.99 * turn.cos(), 0.99 * turn.sin(), 0.08 + 0 * turn), dim=1)
-    for places in (remote, edge_on):
+    for places in (distant, edge_on):
         assert torch.equal(bowl.signed(places) < 0, torch.from_numpy(bowl.winding_number(places.numpy())) > 0.5)
 
 
@@ -202,7 +202,7 @@ PHANTOM = Sphere(radius=0.1, center=(0.85, 0.0, 0.0))
 
 
 def empty(cloud: CloudDistance, field: Sphere | Union, delta: float = 0.05) -> module.Samples:
-    return module.remote_samples(cloud, field, delta, 40_000, generator=generator(), device=CPU).empty
+    return module.off_surface_samples(cloud, field, delta, 40_000, generator=generator(), device=CPU).empty
 
 
 def test_a_sound_level_has_no_empty_places_in_its_band(cloud: CloudDistance) -> None:
@@ -226,7 +226,7 @@ def test_places_in_less_doubt_are_empty_where_normals_are_guesses() -> None:
     level, found = Sphere(radius=RADIUS), {}
     for guessed in (False, True):
         bowl = sphere_below(0.3, guessed=guessed)
-        found[guessed] = module.remote_samples(bowl, level, 0.05, 40_000, generator=generator(), device=CPU)
+        found[guessed] = module.off_surface_samples(bowl, level, 0.05, 40_000, generator=generator(), device=CPU)
         for places, sure in ((found[guessed].empty, True), (found[guessed].unseen, False)):
             depth = np.abs(bowl.winding_number(places.points.numpy()) - 0.5)
             # Which dipoles count one by one depends on the places of one call.
@@ -240,14 +240,16 @@ def test_a_level_keeps_what_was_not_scanned(cloud: CloudDistance) -> None:
     """In the hole, and only there, more than δ from its rim, with the value of the level before."""
     level, delta = Sphere(radius=RADIUS - 0.01), 0.05
     assert len(empty(sphere_below(0.8), Sphere(radius=RADIUS))) == 0
-    found = module.remote_samples(sphere_below(0.8), level, delta, 40_000, generator=generator(), device=CPU).unseen
+    found = module.off_surface_samples(
+        sphere_below(0.8), level, delta, 40_000, generator=generator(), device=CPU
+    ).unseen
     assert len(found) > 1000
     assert torch.equal(found.distance, level.value(found.points))
     up = found.points[:, 2] / found.points.norm(dim=1)
     rim = np.cos(np.arccos(0.8) - np.arcsin(delta / (RADIUS + delta)))  # δ away from it, outside at the most
     assert (up > rim - 0.01).all()
     assert up.max() > 0.999
-    whole = module.remote_samples(cloud, level, delta, 40_000, generator=generator(), device=CPU)
+    whole = module.off_surface_samples(cloud, level, delta, 40_000, generator=generator(), device=CPU)
     assert len(whole.unseen) == len(whole.empty) == 0
 
 
@@ -330,10 +332,10 @@ def test_usual_errors_are_those_of_the_smooth_places() -> None:
     tilted = angle.cos()[:, None] * normals + angle.sin()[:, None] * across
     surface = module.with_previous(module.Samples(points, off, tilted), Sphere(radius=RADIUS), 0.1, device=CPU)
     band = module.Samples(points, gradient=normals * (1 + torch.linspace(0, 0.2, 1001))[:, None])
-    usual = module.usual_errors(surface, band)
-    assert usual.data == pytest.approx(0.01**2, rel=1e-3)
-    assert usual.normal == pytest.approx(1 - np.cos(np.deg2rad(4)), rel=2e-3)  # float32 rounds by 6e-8 of 2e-3
-    assert usual.eikonal == pytest.approx(0.1**2, rel=1e-3)
+    scales = module.robust_scales(surface, band)
+    assert scales.data == pytest.approx(0.01**2, rel=1e-3)
+    assert scales.normal == pytest.approx(1 - np.cos(np.deg2rad(4)), rel=2e-3)  # float32 rounds by 6e-8 of 2e-3
+    assert scales.eikonal == pytest.approx(0.1**2, rel=1e-3)
 
 
 @pytest.mark.parametrize("robust", [True, False])
@@ -343,13 +345,13 @@ def test_the_scales_of_errors_are_those_of_the_level_before(robust: bool) -> Non
     sources = module.banded_sources(index, Sphere(radius=RADIUS - 0.01), 0.05, config, generator=generator())
     # The normals of the spheres are alike, their gradients of length 1. The first residual squares its distances.
     expected = (np.inf, *module.LEAST[1:]) if robust else module.SQUARES
-    assert [tuple(source.usual) for source in sources] == [tuple(expected)] * 3
+    assert [tuple(source.scales) for source in sources] == [tuple(expected)] * 3
     nothing = Siren(8, 2, omega=10.0)
     torch.nn.init.zeros_(nothing.output.weight)
     torch.nn.init.zeros_(nothing.output.bias)
     two = MultiscaleSDF(Sphere(radius=RADIUS - 0.01), [nothing], [0.05])
     sources = module.banded_sources(index, two, 0.05, config, generator=generator())
-    assert sources[0].usual.data == (pytest.approx(1e-4, rel=1e-4) if robust else np.inf)
+    assert sources[0].scales.data == (pytest.approx(1e-4, rel=1e-4) if robust else np.inf)
 
 
 FOUR = torch.tensor([0.01, -0.02, 0.005, 0.0])

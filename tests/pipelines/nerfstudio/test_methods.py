@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError, Sphere, ViewColor
-from mplicits.pipelines.nerfstudio.export import export_mesh, host_cameras, in_data_coordinates, main, part_seen
+from mplicits.pipelines.nerfstudio.export import export_mesh, host_cameras, in_data_coordinates, main, visible_mesh
 from mplicits.pipelines.surface.surface import read_surface
 from nerfstudio_stand_in import PLUGIN, Heads, stand_in
 from torch import Tensor, nn
@@ -163,7 +163,7 @@ def test_only_what_cameras_see_is_left(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert height.max() == pytest.approx(1, abs=0.01)
     assert height.min() == pytest.approx(1 / 8, abs=2 * pixel)
     with pytest.raises(NoSurfaceError, match="no two photographs see any of it"):
-        part_seen(RED_BALL.mesh(16), RED_BALL, host_cameras(cameras([50.0, 51.0])))
+        visible_mesh(RED_BALL.mesh(16), RED_BALL, host_cameras(cameras([50.0, 51.0])))
 
 
 def test_a_texture_has_the_colours_and_normals_of_the_field(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

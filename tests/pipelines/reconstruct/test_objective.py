@@ -297,7 +297,7 @@ def test_rays_that_miss_the_region_leave_the_eikonal_term_alone(images: PosedIma
     objective = scene_trainer(build_scene(config, has_masks=True), pool, config).objective
     terms, _ = objective.losses(0, 0.5)
     generator = torch.Generator().manual_seed(config.seed)  # the same rays, and the same sections
-    rays = pool.draw(objective.batch(), generator, objective.focus)
+    rays = pool.draw(objective.batch(), generator, objective.sampler)
     near, far = sphere_span(rays.origins, rays.directions)
     hits = far > near
     assert 0 < int(hits.sum()) < len(hits)

@@ -358,7 +358,7 @@ def test_the_colour_is_the_lower_quartile_of_those_that_face_a_point() -> None:
     torch.testing.assert_close(alone, torch.tensor([0.5, 0.5, 1.0]), atol=1e-6, rtol=0)
 
 
-def test_meshes_of_what_was_seen(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_meshes_of_what_is_visible(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Cameras stand all around the sphere, so that its mesh stays; with the points of a side, that side is left."""
     run = tmp_path / "run"
     shutil.copytree(finished, run)

@@ -17,7 +17,7 @@ from mplicits.neural_fields.networks.grids import ValueGrid
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct import views as posed
-from mplicits.pipelines.surface.surface import Support, seen_part, thinned
+from mplicits.pipelines.surface.surface import Support, thinned, visible_part
 from reconstructions import exact_model, painted_sphere
 
 WHITE = torch.ones(3)
@@ -175,7 +175,7 @@ def test_a_reduced_view_sees_the_same_in_fewer_pixels() -> None:
 RADIUS, DISTANCE = 0.5, 2.0
 
 
-def photograph(eye: tuple[float, float, float], *, masked: bool = False) -> posed.SeenFrom:
+def photograph(eye: tuple[float, float, float], *, masked: bool = False) -> posed.MaskedCamera:
     """Of the unit sphere; its mask, if it has one, is the left half of the picture."""
     camera = look_at(eye, (0.0, 0.0, 0.0), fov=40, width=160, height=120)
     mask = np.zeros((120, 160), np.float32)
@@ -183,19 +183,19 @@ def photograph(eye: tuple[float, float, float], *, masked: bool = False) -> pose
     return camera, mask if masked else None
 
 
-def share_seen(views: list[posed.SeenFrom]) -> tuple[float, np.ndarray]:
+def share_visible(views: list[posed.MaskedCamera]) -> tuple[float, np.ndarray]:
     """Of the area of the sphere; and the points."""
     field = Sphere(radius=RADIUS)
-    points, within = posed.seen_points(field, views)
+    points, within = posed.visible_points(field, views)
     assert points.norm(dim=1).numpy() == pytest.approx(RADIUS, abs=2e-3)
     mesh = extract_mesh(field, resolution=64)
-    _, missed = seen_part(mesh, Support(points.numpy(), within, seen=True))
+    _, missed = visible_part(mesh, Support(points.numpy(), within, visible=True))
     return 1 - missed, points.numpy()
 
 
 def test_two_cameras_side_by_side_see_a_cap() -> None:
     """From distance d a sphere is seen where its normal is within acos(r / d) of the eye, (1 − r / d) / 2 of it."""
-    share, points = share_seen([photograph((x, 0.0, DISTANCE)) for x in (0.02, -0.02)])
+    share, points = share_visible([photograph((x, 0.0, DISTANCE)) for x in (0.02, -0.02)])
     # The rim: two pixels' width, of 40° / 120 at 1.5 to 2, and as much again by which the points end before it, and the
     # places in which views are counted; of a circle around a sphere, in units of its area.
     pixel = 2 * 2 * math.tan(math.radians(20)) / 120 * DISTANCE
@@ -204,20 +204,20 @@ def test_two_cameras_side_by_side_see_a_cap() -> None:
     assert (points[:, 2] > RADIUS * RADIUS / DISTANCE - 1 / 32).all()
 
 
-def test_what_one_camera_or_none_sees_is_not_seen() -> None:
+def test_what_one_camera_or_none_sees_is_not_visible() -> None:
     ahead, behind = (0.0, 0.0, DISTANCE), (0.0, 0.0, -DISTANCE)
-    _, points = share_seen([photograph(ahead), photograph((0.05, 0.0, DISTANCE)), photograph(behind)])
+    _, points = share_visible([photograph(ahead), photograph((0.05, 0.0, DISTANCE)), photograph(behind)])
     assert (points[:, 2] > 0).all()
-    _, points = share_seen([photograph(ahead)])  # but a single one is all that there is
+    _, points = share_visible([photograph(ahead)])  # but a single one is all that there is
     assert len(points) > 100
     aside = look_at((50.0, 0.0, 0.0), (100.0, 0.0, 0.0), fov=20, width=16, height=12)
-    points, _ = posed.seen_points(Sphere(radius=RADIUS), [(aside, None), (aside, None)])
+    points, _ = posed.visible_points(Sphere(radius=RADIUS), [(aside, None), (aside, None)])
     assert len(points) == 0
 
 
 def test_pictures_of_few_pixels_meet_in_places_as_wide_as_those() -> None:
     few = [look_at((x, 0.0, DISTANCE), (0.0, 0.0, 0.0), fov=40, width=8, height=8) for x in (0.1, -0.1)]
-    points, within = posed.seen_points(Sphere(radius=RADIUS), [(camera, None) for camera in few])
+    points, within = posed.visible_points(Sphere(radius=RADIUS), [(camera, None) for camera in few])
     # A pixel at the nearest point and at the rim, twice, of 40° / 8: the diagonal of a place is longer than the shift
     # between the two pictures, so that most of their pixels share one.
     nearest, rim = DISTANCE - RADIUS, math.sqrt(DISTANCE**2 - RADIUS**2)
@@ -227,23 +227,23 @@ def test_pictures_of_few_pixels_meet_in_places_as_wide_as_those() -> None:
 
 
 def test_masks_say_what_of_it_is_the_object() -> None:
-    _, points = share_seen([photograph((x, 0.0, DISTANCE), masked=True) for x in (0.02, -0.02)])
+    _, points = share_visible([photograph((x, 0.0, DISTANCE), masked=True) for x in (0.02, -0.02)])
     # One half of what is in the picture, but for the cameras' distance: the middle of each sees 0.02 · r / d to a side.
     assert max((points[:, 0] > -0.02).mean(), (points[:, 0] < 0.02).mean()) == 1
     assert np.abs(points[:, 0]).max() > 0.4
 
 
-def test_the_part_that_was_seen() -> None:
+def test_the_visible_part() -> None:
     two = Union(Sphere(radius=0.2, center=(0.5, 0.0, 0.0)), Sphere(radius=0.2, center=(-0.5, 0.0, 0.0)))
     mesh = extract_mesh(two, resolution=64)
     right = mesh.vertices[mesh.vertices[:, 0] > 0].astype(np.float64)
-    kept = thinned(right, seen_within=0.01)
-    support = Support(kept["points"].double().numpy(), float(kept["seen_within"]), seen=True)
-    part, missed = seen_part(mesh, support)
+    kept = thinned(right, visible_within=0.01)
+    support = Support(kept["points"].double().numpy(), float(kept["seen_within"]), visible=True)
+    part, missed = visible_part(mesh, support)
     assert missed == pytest.approx(0.5, abs=1e-3)
     assert (part.vertices[:, 0] > 0).all()
     assert len(part.faces) == len(mesh.faces) // 2
-    assert seen_part(mesh, support._replace(points=np.array([[0.0, 0.0, 0.9]])))[0] is None
+    assert visible_part(mesh, support._replace(points=np.array([[0.0, 0.0, 0.9]])))[0] is None
 
 
 def test_seen_needs_a_run_of_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,7 +4,15 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from mplicits.pipelines.training.trainer import Focus, Group, Objective, Progress, StopFlag, Trainer, warm_cosine
+from mplicits.pipelines.training.trainer import (
+    ErrorWeightedSampler,
+    Group,
+    Objective,
+    Progress,
+    StopFlag,
+    Trainer,
+    warm_cosine,
+)
 from torch import Tensor, nn
 
 STEPS = 50
@@ -117,12 +125,12 @@ def generator() -> torch.Generator:
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_strips_are_drawn_by_their_errors_and_their_pixels_alike(share: float) -> None:
-    focus = Focus(PIXELS, share, CPU)
-    focus.errors = torch.tensor([0.0, 1.0, 0.0, 3.0, 0.5, 0.5])
-    focus.refresh()
-    rows = focus.rows(DRAWS, generator())
+    sampler = ErrorWeightedSampler(PIXELS, share, CPU)
+    sampler.errors = torch.tensor([0.0, 1.0, 0.0, 3.0, 0.5, 0.5])
+    sampler.refresh()
+    rows = sampler.rows(DRAWS, generator())
     lengths = torch.tensor([STRIP] * 5 + [3])
-    by_error = (focus.errors / focus.errors.sum() / lengths).repeat_interleave(lengths)
+    by_error = (sampler.errors / sampler.errors.sum() / lengths).repeat_interleave(lengths)
     chance = (1 - share) / PIXELS + share * by_error
     count = torch.bincount(rows, minlength=PIXELS)
     # Five standard deviations of a binomial count: of 83 of them one is outside in 20,000 seeds.
@@ -131,23 +139,23 @@ def test_strips_are_drawn_by_their_errors_and_their_pixels_alike(share: float) -
 
 
 def test_errors_count_once_they_are_looked_at() -> None:
-    focus = Focus(PIXELS, 1.0, CPU)
-    focus.learn(torch.arange(STRIP, PIXELS), torch.zeros(PIXELS - STRIP))
-    assert (focus.rows(1000, generator()) >= STRIP).any()
+    sampler = ErrorWeightedSampler(PIXELS, 1.0, CPU)
+    sampler.learn(torch.arange(STRIP, PIXELS), torch.zeros(PIXELS - STRIP))
+    assert (sampler.rows(1000, generator()) >= STRIP).any()
     for _ in range(60):  # without errors the means of the others go to 0
-        focus.learn(torch.arange(STRIP, PIXELS), torch.zeros(PIXELS - STRIP))
-    focus.refresh()
-    assert (focus.rows(1000, generator()) < STRIP).all()
+        sampler.learn(torch.arange(STRIP, PIXELS), torch.zeros(PIXELS - STRIP))
+    sampler.refresh()
+    assert (sampler.rows(1000, generator()) < STRIP).all()
 
 
 def test_a_strip_has_the_mean_of_what_was_known_and_of_what_is_said() -> None:
-    focus = Focus(PIXELS, 0.5, CPU)
-    focus.learn(torch.tensor([0, 1, STRIP]), torch.tensor([0.2, 0.6, 3.0]))
-    torch.testing.assert_close(focus.errors, torch.tensor([(1 + 0.2 + 0.6) / 3, 2.0, 1.0, 1.0, 1.0, 1.0]))
+    sampler = ErrorWeightedSampler(PIXELS, 0.5, CPU)
+    sampler.learn(torch.tensor([0, 1, STRIP]), torch.tensor([0.2, 0.6, 3.0]))
+    torch.testing.assert_close(sampler.errors, torch.tensor([(1 + 0.2 + 0.6) / 3, 2.0, 1.0, 1.0, 1.0, 1.0]))
 
 
 def test_without_a_share_pixels_are_drawn_by_chance_and_nothing_is_learnt() -> None:
-    focus = Focus(PIXELS, 0.0, CPU)
-    focus.learn(torch.arange(PIXELS), torch.zeros(PIXELS))
-    assert (focus.errors == 1).all()
-    assert torch.equal(focus.rows(50, generator()), torch.randint(PIXELS, (50,), generator=generator()))
+    sampler = ErrorWeightedSampler(PIXELS, 0.0, CPU)
+    sampler.learn(torch.arange(PIXELS), torch.zeros(PIXELS))
+    assert (sampler.errors == 1).all()
+    assert torch.equal(sampler.rows(50, generator()), torch.randint(PIXELS, (50,), generator=generator()))

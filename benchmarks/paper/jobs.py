@@ -1,12 +1,12 @@
-"""Cells of the paper's tables, one method trained once on one cloud, and what tables read in their records.
+"""Jobs of the paper's tables, one method trained once on one cloud, and what tables read in their records.
 
-A record is what a cell found, as it stands in its JSON file::
+A record holds the results of a job, as its JSON file does::
 
     {"cell": {"shape": stem, "method", "preset", "seed", "noise", "outliers", "flipped", "overrides": {…}, …},
      "outputs": [{"name", "chamfer", "iou", …}, …],   # one per surface, coarse to fine
      "deltas": [δ_1, …], …}
 
-A cell that failed has no record; tables say "–" where one is missing.
+A job that failed has no record; tables say "–" where one is missing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from ..harness.cells import Record
+from ..harness.jobs import Record
 from ..harness.plots import Plot
 from ..harness.tables import Table
 
@@ -26,8 +26,8 @@ Preset = Literal["smoke", "cpu", "paper"]
 
 
 @dataclass(frozen=True)
-class PaperCell:
-    """One training, with all that decides how it ends; see `benchmarks.harness.cells.Cell`.
+class PaperJob:
+    """One training, with all that decides how it ends; see `benchmarks.harness.jobs.Job`.
 
     Attributes:
         shape: the file; its vertices are the cloud.
@@ -105,9 +105,9 @@ class TableSpec:
         name: as after ``--table``.
         label: the paper's own, e.g. "Tab. 1 (t-comparison)".
         summary: what it shows, in one line.
-        cells: the shapes and the preset → what must be trained. Seeds, references and the choice of methods are
+        jobs: the shapes and the preset → what must be trained. Seeds, references and the choice of methods are
             the harness's business.
-        tables: the records of those cells, as many as there are → the tables.
+        tables: the records of those jobs, as many as there are → the tables.
         plots: the same → the plots.
         sheets: whether there is a contact sheet of its meshes per shape.
     """
@@ -115,14 +115,14 @@ class TableSpec:
     name: str
     label: str
     summary: str
-    cells: Callable[[Sequence[Path], Preset], list[PaperCell]]
+    jobs: Callable[[Sequence[Path], Preset], list[PaperJob]]
     tables: Callable[[Sequence[Record]], tuple[Table, ...]]
     plots: Callable[[Sequence[Record]], tuple[Plot, ...]] = lambda _: ()
     sheets: bool = False
 
 
-def cells_of(spec: TableSpec, inputs: Sequence[Input], preset: Preset, *, seed: int = 0) -> list[PaperCell]:
-    """The cells of a table, with seed and references, each once.
+def jobs_of(spec: TableSpec, inputs: Sequence[Input], preset: Preset, *, seed: int = 0) -> list[PaperJob]:
+    """The jobs of a table, with seed and references, each once.
 
     Args:
         spec: the table.
@@ -131,13 +131,13 @@ def cells_of(spec: TableSpec, inputs: Sequence[Input], preset: Preset, *, seed: 
         seed: of everything.
     """
     references = {one.path: one.reference for one in inputs}
-    cells = spec.cells([one.path for one in inputs], preset)
-    planned = [dataclasses.replace(cell, seed=seed, reference=references.get(cell.shape)) for cell in cells]
+    jobs = spec.jobs([one.path for one in inputs], preset)
+    planned = [dataclasses.replace(job, seed=seed, reference=references.get(job.shape)) for job in jobs]
     return list(dict.fromkeys(planned))
 
 
 def select(records: Iterable[Record], **wanted: Any) -> list[Record]:
-    """The records whose cells have these fields; a field that is not named may be anything.
+    """The records whose jobs have these fields; a field that is not named may be anything.
 
     ``overrides`` is compared as a dict: ``select(records, method="ours", noise=0.0, overrides={})``.
     """

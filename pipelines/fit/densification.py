@@ -1,4 +1,4 @@
-"""Points between those of a sparse cloud, which keep a residual level from oscillating there."""
+"""Densification of sparse clouds, which keeps a residual level from oscillating between points."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class BetweenOptions:
-    """Numbers of `densified`; lengths in the units that each comment says."""
+class DensificationOptions:
+    """Numbers of `densified`; lengths in the units of each comment."""
 
     neighbors: int = 16  # that a patch is fitted to
     blended: int = 8  # patches at a place
@@ -48,7 +48,7 @@ class BetweenOptions:
     filling: float = 16.0  # places tried for each point, times k² − 1 at a phase of k `turn`
 
 
-BETWEEN = BetweenOptions()
+DENSIFICATION = DensificationOptions()
 
 
 class Densified(NamedTuple):
@@ -69,11 +69,11 @@ def dense_distance(
     noise: float = 0.0,
     guessed: bool = False,
     seed: int = 0,
-    options: BetweenOptions = BETWEEN,
+    options: DensificationOptions = DENSIFICATION,
 ) -> CloudDistance:
     """Distances to a cloud, densified where it is sparse for a network of frequency ``omega``.
 
-    ``count`` limits the points of the cloud and the places tried between them together. See `CloudDistance` for
+    ``count`` limits the points of the cloud and the candidates between them together. See `CloudDistance` for
     ``noise`` and ``guessed``.
     """
     about = {"noise": noise, "guessed": guessed}
@@ -94,7 +94,7 @@ def dense_distance(
     return CloudDistance(*dense, **about, given=len(points), gaps=gaps, repaired=found.repaired)
 
 
-def _on_solid(index: CloudDistance, x: NDArray[np.float32], options: BetweenOptions) -> Mask:
+def _on_solid(index: CloudDistance, x: NDArray[np.float32], options: DensificationOptions) -> Mask:
     """Whether both sides of each of ``(M, 3)`` surface points have `solid_angle`, by winding numbers."""
     return np.abs(index.winding_number(x, soft=CLOUD.soft_guessed) - 0.5) < 0.5 - options.solid_angle
 
@@ -107,9 +107,9 @@ def densified(
     share: NDArray[np.floating] | None = None,
     guessed: bool = False,
     seed: int = 0,
-    options: BetweenOptions = BETWEEN,
+    options: DensificationOptions = DENSIFICATION,
 ) -> Densified:
-    """Find points of the surface between those of a cloud, by patches fitted to points and normals.
+    """Upsample a cloud: points of the surface between its own, by patches fitted to points and normals.
 
     A point p_i has the patch f_i(x) = ⟨n_i, d⟩ + ½ dᵀ S_i d with d = x − p_i. Its shape operator S_i is the
     least-squares fit of n_j − n_i ≈ S_i (p_j − p_i) over neighbours on an arc of circle with it, ½(n_i + n_j)·(p_j −
@@ -117,8 +117,8 @@ def densified(
     SODA 2005). Only patches with agreeing normals are blended (Öztireli, Guennebaud and Gross, 2009), and places beyond
     an edge or with contradicting patches stay empty: edges stay sharp.
 
-    ``count`` places are tried, in proportion to ``share`` ``(N,)`` beside each point (None: by area). With ``guessed``
-    normals, estimated from noise, new points must have points on all sides.
+    ``count`` candidates are drawn, in proportion to ``share`` ``(N,)`` beside each point (None: by area). With
+    ``guessed`` normals, estimated from noise, new points must have points on all sides.
     """
     if len(points) <= options.neighbors:  # too few for a neighbourhood that is not the whole
         return Densified(normals.astype(np.float64), 0, np.empty((0, 3)), np.empty((0, 3)))
@@ -144,7 +144,7 @@ class _Patches:
     ``reach`` ``(N,)`` is the distance to the sixth neighbour; a patch is ``sound`` if neighbours on all sides agree.
     """
 
-    def __init__(self, points: Float64, normals: Float64, options: BetweenOptions) -> None:
+    def __init__(self, points: Float64, normals: Float64, options: DensificationOptions) -> None:
         self.options = options
         self.points, self.normals = points, normals
         self.tree = KDTree(points, balanced_tree=False)
@@ -198,7 +198,7 @@ class _Patches:
 
 
 def _fitted(
-    chosen: Mask, near: Float64, across: Float64, turn: Float64, options: BetweenOptions
+    chosen: Mask, near: Float64, across: Float64, turn: Float64, options: DensificationOptions
 ) -> tuple[Float64, Float64, Mask]:
     """The normal equations of the shapes, and which patches have ``chosen`` neighbours ``(n, k)`` on all sides.
 

@@ -1,4 +1,4 @@
-"""Points between those of a cloud, against surfaces that are known exactly."""
+"""Densification of clouds, against surfaces that are known exactly."""
 
 from dataclasses import replace
 
@@ -8,9 +8,9 @@ import torch
 from fits import SMALL
 from mplicits.datasets import PointCloud, sample_sphere, sample_torus
 from mplicits.neural_fields import Torus
-from mplicits.pipelines.fit import between, fit
-from mplicits.pipelines.fit.between import BETWEEN, Densified, dense_distance, densified
+from mplicits.pipelines.fit import densification, fit
 from mplicits.pipelines.fit.cloud import CloudDistance
+from mplicits.pipelines.fit.densification import DENSIFICATION, Densified, dense_distance, densified
 from scipy.spatial import KDTree
 
 
@@ -138,7 +138,7 @@ def test_guessed_normals_are_not_followed_beyond_the_rim_of_a_strip() -> None:
     for found, bounded in ((believed, False), (guessed, True)):
         beyond = np.linalg.norm((np.abs(found[:, :2]) - [1, 0.1]).clip(min=0), axis=1)
         fourth = np.asarray(tree.query(found, k=4)[0])[:, 3]
-        assert bool((beyond < BETWEEN.one_sided * fourth).all()) == bounded
+        assert bool((beyond < DENSIFICATION.one_sided * fourth).all()) == bounded
     assert len(guessed) > 0.7 * len(believed)
 
 
@@ -153,7 +153,7 @@ def test_guessed_normals_do_not_lead_beyond_a_corner(monkeypatch: pytest.MonkeyP
     """Winding numbers tell the corner of a solid, which nothing goes beyond, from the rim of an open sheet."""
     points, normals = box(2000)
     places, up = np.array([[0.1, 0.2, 0.5], [0.56, 0.56, 0.56]]), np.tile([0.0, 0.0, 1.0], (2, 1))
-    monkeypatch.setattr(between, "densified", lambda p, n, *_, **__: Densified(n, 0, places, up))
+    monkeypatch.setattr(densification, "densified", lambda p, n, *_, **__: Densified(n, 0, places, up))
     assert np.allclose(noisy_filling(points, normals), places[:1])
     sheet = points * [1, 1, 0]
     assert np.allclose(noisy_filling(sheet, np.tile([0.0, 0.0, 1.0], (len(sheet), 1))), places)
@@ -166,10 +166,10 @@ def test_a_cloud_is_filled_in_where_it_is_sparse_for_the_frequency() -> None:
     normals, plain = 2 * points, CloudDistance(points, 2 * points)
     right = points[:, 0].numpy() > 0
     dense, sparse = np.median(plain.gaps[right]), np.median(plain.gaps[~right])
-    for omega, count in ((0.5 * BETWEEN.turn / dense, 4000), (80.0, len(points))):
+    for omega, count in ((0.5 * DENSIFICATION.turn / dense, 4000), (80.0, len(points))):
         assert len(dense_distance(points, normals, omega=omega, count=count).points) <= max(count, len(points))
-    assert dense_distance(points, normals, omega=0.5 * BETWEEN.turn / sparse, count=40_000).filled < 0.01
-    index = dense_distance(points, normals, omega=BETWEEN.turn / (sparse * dense) ** 0.5, count=40_000)
+    assert dense_distance(points, normals, omega=0.5 * DENSIFICATION.turn / sparse, count=40_000).filled < 0.01
+    index = dense_distance(points, normals, omega=DENSIFICATION.turn / (sparse * dense) ** 0.5, count=40_000)
     assert index.given == len(points)
     assert np.array_equal(index.points[: index.given], points.numpy())
     new = index.points[index.given :]

@@ -1,6 +1,6 @@
-"""A cell: a piece of work that is done once and kept. Every table that needs it shares what it found.
+"""A job is a piece of work that runs once; its results are kept and shared by all tables that need them.
 
-A `Method` does the work of a cell and says what it found; a bench keeps a JSON file per cell, and the meshes, fields
+A `Method` runs a job and returns its results. A bench keeps a JSON file per job, and the meshes, fields
 and pictures that were made on the way.
 """
 
@@ -20,12 +20,12 @@ from mplicits.neural_fields.backend.files import write_json
 from mplicits.pipelines.training.settings import closest
 from mplicits.pipelines.training.trainer import Progress, Report
 
-# What a cell found, as it stands in its JSON file; see `benchmarks.harness.run.run_cell`.
+# The results of a job as its JSON file holds them; see `benchmarks.harness.run.run_job`.
 Record = Mapping[str, Any]
 
 
-class Cell(Protocol):
-    """A piece of work, with all that decides how it ends; hashable."""
+class Job(Protocol):
+    """A piece of work, with everything that determines its result; hashable."""
 
     @property
     def method(self) -> str:
@@ -52,23 +52,23 @@ class Cell(Protocol):
         ...
 
 
-C = TypeVar("C", bound=Cell)
+C = TypeVar("C", bound=Job)
 
 
-def key_of(cell: Cell, settings: Mapping[str, Any]) -> str:
-    """Twelve hexadecimal digits of everything that decides the result of a cell.
+def key_of(job: Job, settings: Mapping[str, Any]) -> str:
+    """Twelve hexadecimal digits of everything that decides the result of a job.
 
     Files count by what they hold, not by their names, so that a file that has moved does not make work again.
 
     Args:
-        cell: the work.
-        settings: of the protocol and of the method, as far as they are not in the cell.
+        job: the work.
+        settings: of the protocol and of the method, as far as they are not in the job.
 
     Raises:
         OSError: a file cannot be read.
     """
-    files = [None if path is None else _digest(path) for path in cell.inputs]
-    text = json.dumps([files, {"method": cell.method, **cell.parameters}, dict(settings)], sort_keys=True)
+    files = [None if path is None else _digest(path) for path in job.inputs]
+    text = json.dumps([files, {"method": job.method, **job.parameters}, dict(settings)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
@@ -78,17 +78,16 @@ def _digest(path: Path) -> str:
 
 
 @dataclass(frozen=True)
-class Workplace:
-    """Where a method works.
+class Context:
+    """Folder, device and callbacks that a method is given for one job.
 
     Attributes:
         out: the folder of the bench, which holds ``meshes``, ``pictures`` and ``runs``.
-        key: of the cell; names of files begin with it.
+        key: of the job; names of files begin with it.
         device: a torch device.
         progress: called now and then with how far the training is.
         say: told what comes next.
-        first: does another cell, unless it is done, before this one goes on from what it left → where it works; given
-            by `run_cell`.
+        first: runs another job, unless it has a record, and returns that job's context; set by `run_job`.
     """
 
     out: Path
@@ -96,7 +95,7 @@ class Workplace:
     device: str = "cpu"
     progress: Report | None = None
     say: Callable[[str], None] = lambda _: None
-    first: Callable[[Any], Workplace] | None = None
+    first: Callable[[Any], Context] | None = None
 
     def stage(self, name: str) -> Report:
         """A receiver of progress that puts ``name`` before the names of its stages."""
@@ -121,8 +120,8 @@ class Workplace:
 
 
 @dataclass(frozen=True)
-class Findings:
-    """What a cell found.
+class Results:
+    """The results of a job.
 
     Attributes:
         outputs: one dict of figures per surface (coarse to fine, each with its "name") or row; all of it JSON.
@@ -139,10 +138,10 @@ class Method(ABC, Generic[C]):
     """A method, or a measurement, that tables ask for by name.
 
     Attributes:
-        name: as in `Cell.method`.
+        name: as in `Job.method`.
         source: where it comes from.
         differs: what differs from its source here.
-        depends: whether its cells go on from cells of methods that do not.
+        depends: whether its jobs go on from jobs of methods that do not.
     """
 
     name: str
@@ -150,21 +149,21 @@ class Method(ABC, Generic[C]):
     differs: str
     depends: bool = False
 
-    def goes_on(self, cell: C) -> bool:
-        """Whether a cell goes on from others, which do not go on from any."""
+    def goes_on(self, job: C) -> bool:
+        """Whether a job starts from the results of others, which themselves start from none."""
         return self.depends
 
     def missing(self) -> str | None:
         """What must be installed for it, in a few words; None if nothing is missing."""
         return None
 
-    def settings(self, cell: C) -> Mapping[str, Any]:
-        """What decides the result beside the cell itself, as JSON; part of the key."""
+    def settings(self, job: C) -> Mapping[str, Any]:
+        """What decides the result beside the job itself, as JSON; part of the key."""
         return {}
 
     @abstractmethod
-    def run(self, cell: C, work: Workplace) -> Findings:
-        """Do the work of a cell.
+    def run(self, job: C, context: Context) -> Results:
+        """Run a job.
 
         Raises:
             InputError: an option or a file cannot be read or used.
@@ -172,19 +171,19 @@ class Method(ABC, Generic[C]):
 
 
 @dataclass(frozen=True)
-class Catalogue(Generic[C]):
+class Registry(Generic[C]):
     """The methods that a bench knows.
 
     Attributes:
         methods: all of them, in the order of the tables' rows.
-        protocol: what decides the figures of every method beside its own settings, for a cell; part of its key.
+        protocol: what decides the figures of every method beside its own settings, for a job; part of its key.
     """
 
     methods: Sequence[Method[C]]
     protocol: Callable[[C], Mapping[str, Any]] = lambda _: {}
 
     def named(self, name: str) -> Method[C]:
-        """The method that a cell asks for.
+        """The method that a job asks for.
 
         Raises:
             ValueError: there is none.
@@ -194,14 +193,14 @@ class Catalogue(Generic[C]):
                 return method
         raise ValueError(f"method {name!r}: there is none{closest(name, [method.name for method in self.methods])}")
 
-    def key(self, cell: C) -> str:
-        """The name under which a cell is stored: all that decides its figures.
+    def key(self, job: C) -> str:
+        """The name under which a job is stored: all that decides its figures.
 
         Raises:
             OSError: a file cannot be read.
             ValueError: there is no such method.
         """
-        return key_of(cell, {**self.protocol(cell), **self.named(cell.method).settings(cell)})
+        return key_of(job, {**self.protocol(job), **self.named(job.method).settings(job)})
 
 
 def _slug(name: str) -> str:
@@ -227,12 +226,12 @@ def make_folder(out: Path) -> None:
 
 
 def record_file(out: Path, key: str) -> Path:
-    """Where the record of a cell is."""
+    """Where the record of a job is."""
     return out / "cells" / f"{key}.json"
 
 
 def read_record(out: Path, key: str) -> Record | None:
-    """The record of a finished cell; None where there is none, it is damaged, or the cell failed."""
+    """The record of a finished job; None where there is none, it is damaged, or the job failed."""
     try:
         record: dict[str, Any] = json.loads(record_file(out, key).read_text(encoding="utf-8"))
     except (OSError, ValueError):
