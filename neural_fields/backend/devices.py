@@ -6,7 +6,6 @@ import functools
 import importlib.metadata
 import os
 import platform
-import statistics
 import sys
 import threading
 import time
@@ -319,7 +318,7 @@ def best_seconds(work: Callable[[], object], *, repeats: int = 5, median: bool =
         if torch.cuda.is_available():
             torch.cuda.synchronize()
         times.append(time.perf_counter() - start)
-    return statistics.median(times) if median else min(times)
+    return sorted(times)[repeats // 2] if median else min(times)
 
 
 @torch.inference_mode()

@@ -207,11 +207,12 @@ class PointMemo:
     """Keeps one half of the last pair (value, gradient) until it is requested, at the very same points.
 
     Renderers like NeuS's call for the values and then, by another method, for the gradient at the same tensor. The
-    first call evaluates both and returns its half; the second gets the other, once. The kept half is dropped
+    first call evaluates both and returns its half; the second gets the other, once. The kept half is dropped in
+    three cases:
 
-    - when it is returned, or anything else is requested;
-    - when the points or the returned half die, so no graph lives longer than the caller's own tensors;
-    - when a gradient flows back through the returned half: autograd may have freed the graph of both.
+    - It is returned, or anything else is requested.
+    - The points or the returned half die, so no graph lives longer than the caller's own tensors.
+    - A gradient flows back through the returned half: autograd may have freed the graph of both.
 
     It is used only for the same tensor object at the same version, with the same tensors of the module at the same
     versions, and in the same grad mode. Writes through ``.data`` or NumPy between the two calls are not noticed.

@@ -1,11 +1,11 @@
 """Tracing surfaces that move, with what one frame shows about the next ones.
 
 **Key frames** are traced from scratch (`sphere_trace`), and record for every ray where it comes within ``reach`` of the
-surface. Until the surface may have moved that far, the frames in between
+surface. Until the surface may have moved that far, the frames in between trace less:
 
-- leave out rays that never came near it,
-- begin the others where they came near, and end those that passed where they left it again,
-- start at a ray's expected hit, from its depths in the last two frames, if the key frame saw an even fall to the hit.
+- Rays that never came near it are left out.
+- The others begin where they came near. Those that passed end where they left it again.
+- A ray starts at its expected hit, from its depths in the last two frames, if the values fell evenly to the hit.
 
 These rest on the ``speed``, a bound on |∂f/∂t|: a point with f ≥ reach stays outside for ``reach / speed``. Until the
 next key frame they miss what grows out of the last stretch of an even fall, and a spike between two clear samples of a
