@@ -45,9 +45,8 @@ def _seed() -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the fake accelerator in float64: it computes on the CPU, so that only its errors differ."""
     params = {item: item.callspec.params for item in items if hasattr(item, "callspec")}
-    again = {
-        i for i, p in params.items() if (p.get("device"), p.get("dtype")) == (fake_accelerator.NAME, torch.float64)
-    }
+    fake = (fake_accelerator.NAME, torch.float64)
+    again = {i for i, p in params.items() if (p.get("device"), p.get("dtype")) == fake}
     config.hook.pytest_deselected(items=list(again))
     items[:] = [item for item in items if item not in again]
 

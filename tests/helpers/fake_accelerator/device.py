@@ -142,9 +142,7 @@ def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
         back = [_argument(args, kwargs, place) for place in operation.written]
         for shell in back:
             if isinstance(shell, FakeAcceleratorTensor) and shell.shape != shell.inner.shape:
-                shell.data = FakeAcceleratorTensor(
-                    shell.inner
-                )  # it was squeezed, or it was to be as large as its content
+                shell.data = FakeAcceleratorTensor(shell.inner)  # it was squeezed or resized
         return back[0] if len(back) == 1 else tuple(back)
     target = kwargs.get("device")
     return result if target is not None and torch.device(target).type != NAME else _shelled(result)
