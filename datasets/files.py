@@ -107,6 +107,13 @@ def read_json(path: Path, *, missing: str = "check the path") -> Any:
         raise InputError(f"{path}: is not JSON ({error}); export it again") from error
 
 
+def decoded(data: bytes) -> str:
+    """The text of a file in UTF-8 or, with a byte-order mark, UTF-16; lines end in LF, whatever they ended in."""
+    wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+    text = data.decode("utf-16" if wide else "utf-8-sig", "replace")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
 def finite_number(value: Any, named: str) -> float:
     """A finite number of a JSON file; ``named`` are file and field, for messages."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):

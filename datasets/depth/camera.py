@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...neural_fields import InputError
 from ..cameras import COEFFICIENTS, Camera, intrinsics, pinhole_intrinsics
-from ..files import finite_number, read_json, readable, reader
+from ..files import decoded, finite_number, read_json, readable, reader
 
 Float64 = NDArray[np.float64]
 
@@ -125,7 +125,7 @@ def read_intrinsics(path: str | Path, *, size: tuple[int, int] | None = None) ->
         content = read_json(path, missing=f"check the path, or {fix}")
     else:
         with readable(path, missing=f"check the path, or {fix}"):
-            text = path.read_bytes().decode("utf-8-sig", "replace")
+            text = decoded(path.read_bytes())
         content = _from_text(text, path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected width, height, fx, fy, cx and cy, or a 3 × 3 matrix; or {fix}")

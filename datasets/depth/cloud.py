@@ -92,6 +92,7 @@ class DepthReport:
     typical: float  # 99 % quantile of the depths of kept points; of several frames, the largest
     seen_through: int = 0  # points that other frames see through
     thinned: int = 0  # points that were dropped by thinning
+    lost: int = 0  # depth maps that were left out, since their pose is lost
 
     def summary(self) -> str:
         """The report in a few lines."""
@@ -106,6 +107,7 @@ class DepthReport:
         }
         parts = ", ".join(f"{count:,} {what}" for what, count in dropped.items() if count)
         maps = "1 depth map" if self.frames == 1 else f"{self.frames} depth maps"
+        maps += f" ({self.lost} without a pose left out)" if self.lost else ""
         smoothing = f"smoothed over {self.smoothing} pixels" if self.smoothing else "not smoothed"
         lines = [
             f"{maps}: {self.kept:,} points of {self.pixels:,} pixels" + (f"; dropped {parts}" if parts else ""),

@@ -15,14 +15,15 @@ from scipy.spatial.transform import Rotation
 from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in
 from ..cameras import Camera
-from ..files import finite_number, read_json, readable, reader
+from ..files import decoded, finite_number, read_json, readable, reader
 from ..views.images import read_cameras
 from .camera import DepthCamera, read_intrinsics
 from .images import fit_color, read_color, read_depth
 
 Float64 = NDArray[np.float64]
 PosedFrame = tuple[str | None, Float64, DepthCamera | None]
-"""Name of the frame's image, if the file has names; its world_from_camera (4, 4); its lens, if the file has one."""
+"""Name of the frame's image, if the file has names; its world_from_camera (4, 4), NaN for a frame whose pose was lost;
+its lens, if the file has one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +113,9 @@ def read_poses(path: str | Path) -> list[PosedFrame]:
     - JSON: ``transforms.json``, which also brings names and lenses; Open3D's camera trajectories and parameters;
       Record3D's ``metadata``.
 
+    A frame without a single finite number, as ScanNet and trackers write it where they lost the camera, has a pose of
+    NaN.
+
     Raises:
         InputError: the file is none of these, or a pose in it is not rigid.
     """
@@ -125,7 +129,7 @@ def read_poses(path: str | Path) -> list[PosedFrame]:
 
 
 def read_trajectory(path: str | Path) -> Float64:
-    """The poses ``(F, 4, 4)`` of a file; see `read_poses`."""
+    """The poses ``(F, 4, 4)`` of a file, NaN for lost ones; see `read_poses`."""
     return np.stack([pose for _, pose, _ in read_poses(path)])
 
 
@@ -137,7 +141,7 @@ def _file_poses(path: Path) -> list[PosedFrame]:
     if path.suffix.lower() == ".json" or path.name == "metadata":
         return _json_poses(path)
     with readable(path):
-        text = re.sub(r"#.*", "", path.read_bytes().decode("utf-8-sig", "replace")).replace(",", " ")
+        text = re.sub(r"#.*", "", decoded(path.read_bytes())).replace(",", " ")
     lines = [line.split() for line in text.splitlines() if line.strip()]
     try:
         rows = [[float(word) for word in words] for words in lines]
@@ -200,12 +204,17 @@ def _from_quaternion(place: list[float], quaternion: list[float]) -> Float64:
 
 
 def _rigid(matrix: Any, named: str, axes: Float64 | None = None) -> Float64:
-    """A pose ``(4, 4)`` of ``(3, 4)`` or ``(4, 4)`` numbers: with the nearest rotation, if RᵀR is within 1e-3 of I."""
+    """A pose ``(4, 4)`` of ``(3, 4)`` or ``(4, 4)`` numbers: with the nearest rotation, if RᵀR is within 1e-3 of I.
+
+    All NaN if none of the first three rows' numbers is finite.
+    """
     try:
         pose = np.concatenate((np.asarray(matrix, np.float64), [[0, 0, 0, 1]]))[: max(4, len(matrix))]
     except (TypeError, ValueError) as error:
         raise InputError(f"{named}: expected the numbers of a pose; {error}") from error
     turn = pose[:3, :3]
+    if pose.shape == (4, 4) and not np.isfinite(pose[:3]).any():
+        return np.full((4, 4), np.nan)
     finite = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
     off = np.abs(turn.T @ turn - np.eye(3)).max() if finite else np.inf
     if off > 1e-3 or np.linalg.det(turn) < 0 or bool((pose[3] != (0, 0, 0, 1)).any()):

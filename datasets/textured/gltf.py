@@ -78,10 +78,12 @@ class _Document:
     @classmethod
     def load(cls, path: Path) -> _Document:
         data = path.read_bytes()
-        if data[:4] != b"glTF":
-            return cls(path, json.loads(data), b"")
-        if struct.unpack_from("<I", data, 4)[0] != 2:
+        header = json.loads(data) if data[:4] != b"glTF" else None
+        old = struct.unpack_from("<I", data, 4)[0] != 2 if header is None else isinstance(header.get("meshes"), dict)
+        if old:  # its meshes have names, and no numbers
             raise InputError(f"{path}: glTF 1 is not read; export it as glTF 2")
+        if header is not None:
+            return cls(path, header, b"")
         whole, length = struct.unpack_from("<I", data, 8)[0], struct.unpack_from("<I", data, 12)[0]
         if len(data) < whole:
             raise InputError(f"{path}: is cut off after {len(data):,} of {whole:,} bytes; copy or export it again")
@@ -217,7 +219,7 @@ def _piece(
     uv = np.zeros((count, 2))
     key, paint = "", Paint(np.ones((1, 1, 3), np.float32))
     if textures and "material" in primitive:
-        material = document.header["materials"][primitive["material"]].get("pbrMetallicRoughness", {})
+        material = _base_color(document.header["materials"][primitive["material"]])
         info = material.get("baseColorTexture")
         if info is not None:
             uv = _texture_coordinates(document, attributes, info)
@@ -225,6 +227,15 @@ def _piece(
         paint = materials[key] if key in materials else _paint(document, material)
     materials.setdefault(key, paint)
     return _Piece(vertices, faces, uv, colors, list(materials).index(key))
+
+
+def _base_color(material: dict[str, Any]) -> dict[str, Any]:
+    """Base colour and its texture; of older materials (KHR_materials_pbrSpecularGlossiness), the diffuse ones."""
+    older = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+    if older is None or "pbrMetallicRoughness" in material:
+        return material.get("pbrMetallicRoughness", {})
+    names = {"diffuseFactor": "baseColorFactor", "diffuseTexture": "baseColorTexture"}
+    return {new: older[old] for old, new in names.items() if old in older}
 
 
 def _triangles(order: Int64, mode: int) -> Int64:

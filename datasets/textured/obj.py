@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ...neural_fields import InputError
 from ..clouds.readers.meshes import ObjText, triangulate
 from ..clouds.readers.tables import is_number
+from ..files import decoded
 from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 
 Float64 = NDArray[np.float64]
@@ -103,7 +104,7 @@ def _materials(obj: ObjText) -> dict[str, _Material]:
 def _read_mtl(file: Path) -> dict[str, _Material]:
     found: dict[str, _Material] = {}
     name: str | None = None
-    for line in file.read_bytes().decode("utf-8", "replace").splitlines():
+    for line in decoded(file.read_bytes()).splitlines():
         keyword, rest = [*line.split(maxsplit=1), "", ""][:2]
         rest = rest.split(" #")[0].strip()
         if keyword == "newmtl":

@@ -57,7 +57,9 @@ class DepthInput:
 
 def depth_cloud(source: DepthInput) -> tuple[PointCloud, DepthReport]:
     """Read, clean and join depth maps."""
-    return fuse_frames(_Files(source), source.settings)
+    files = _Files(source)
+    cloud, facts = fuse_frames(files, source.settings)
+    return cloud, dataclasses.replace(facts, lost=files.lost)
 
 
 class _Files:
@@ -80,6 +82,11 @@ class _Files:
             pictures = _files(source.color, COLOR_SUFFIXES, "pictures")
             trouble = f"{source.color}: {len(pictures)} pictures, but {len(files)} depth maps; make their names match"
             colors = [*_in_order_of(files, pictures, [picture.name for picture in pictures], trouble)]
+        kept = [k for k, (_, pose, _) in enumerate(posed) if np.isfinite(pose).all()]
+        self.lost = len(files) - len(kept)
+        if not kept:
+            raise InputError(f"{source.poses}: all {len(files)} poses are lost (not finite); track the cameras again")
+        files, posed, colors = [files[k] for k in kept], [posed[k] for k in kept], [colors[k] for k in kept]
         cameras = _cameras(files, posed, source)
         self.parts = list(zip(files, cameras, colors, (pose for _, pose, _ in posed), strict=True))
 

@@ -71,8 +71,24 @@ def _clouds(folder: Path) -> Iterator[Specimen]:
     las = laspy.create(point_format=3, file_version="1.2")
     las.x, las.y, las.z = points.T
     las.red, las.green, las.blue = (colors.T * 65535).astype(np.uint16)
-    las.write(folder / "cloud.las")
-    yield Specimen("cloud.las", (folder / "cloud.las").read_bytes(), datasets.read_cloud)
+    for name in ("cloud.las", "cloud.laz"):
+        las.write(folder / name)
+        yield Specimen(name, (folder / name).read_bytes(), datasets.read_cloud)
+    for kind in ("ascii", "binary", "binary_compressed"):
+        yield Specimen(f"{kind}.pcd", _pcd(kind, np.hstack((points, normals)).astype("<f4")), datasets.read_cloud)
+
+
+def _pcd(kind: str, rows: np.ndarray) -> bytes:
+    head = "VERSION .7\nFIELDS x y z normal_x normal_y normal_z\nSIZE 4 4 4 4 4 4\nTYPE F F F F F F\n"
+    head += f"WIDTH {len(rows)}\nHEIGHT 1\nPOINTS {len(rows)}\nDATA {kind}\n"
+    if kind == "ascii":
+        return (head + "\n".join(" ".join(f"{value:g}" for value in row) for row in rows)).encode()
+    if kind == "binary":
+        return head.encode() + rows.tobytes()
+    fields = rows.T.tobytes()
+    parts = [fields[at : at + 32] for at in range(0, len(fields), 32)]
+    packed = b"".join(bytes([len(part) - 1]) + part for part in parts)  # literals only
+    return head.encode() + struct.pack("<II", len(packed), len(fields)) + packed
 
 
 def _mesh_ply(order: str, polygons: Any) -> bytes:
@@ -151,6 +167,8 @@ def _views(folder: Path) -> Iterator[Specimen]:
     yield Specimen("lens.json", json.dumps(lens).encode(), datasets.read_intrinsics, damage=_as_json)
     log = "".join(f"{i} {i} 0\n" + "\n".join(" ".join(map(str, row)) for row in np.eye(4)) + "\n" for i in range(3))
     yield Specimen("poses.log", log.encode(), datasets.read_poses)
+    tum = "".join(f"{i}.5 {i} 0 0 0 0 0 1\n" for i in range(3))
+    yield Specimen("tum.txt", tum.encode(), datasets.read_poses)
 
 
 def _runs(folder: Path) -> Iterator[Specimen]:

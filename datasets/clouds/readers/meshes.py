@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....neural_fields import InputError
+from ...files import decoded
 from ..point_cloud import PointCloud, colors_from, unit_rows, weld
 from .columns import Table, choose_layout, cloud_from
 from .tables import numbers
@@ -28,8 +29,8 @@ def read_stl(path: Path) -> tuple[PointCloud, Int64]:
     if len(data) >= 84 and len(data) == 84 + 50 * count:
         facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
         corners = np.frombuffer(data, facet, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
-    elif re.match(rb"\s*solid\b", data, re.IGNORECASE):
-        found = re.findall(r"^\s*vertex\s+([^\r\n]*)", data.decode("utf-8", "replace"), re.MULTILINE | re.IGNORECASE)
+    elif re.match(r"\s*solid\b", text := decoded(data), re.IGNORECASE):
+        found = re.findall(r"^\s*vertex\s+([^\n]*)", text, re.MULTILINE | re.IGNORECASE)
         corners = numbers("\n".join(found), path, first_line=1, what="vertex") if found else np.empty((0, 3))
     else:
         raise InputError(f"{path}: not a readable STL file; check its extension or export it again")
@@ -42,7 +43,7 @@ def read_stl(path: Path) -> tuple[PointCloud, Int64]:
 
 def read_off(path: Path) -> tuple[PointCloud, Int64]:
     """An OFF file, with or without faces; NOFF has normals and COFF colours at its vertices."""
-    text = re.sub(r"#[^\r\n]*", "", path.read_bytes().decode("utf-8", "replace"))
+    text = re.sub(r"#[^\n]*", "", decoded(path.read_bytes()))
     head = re.match(r"\s*(ST)?(C)?(N)?OFF\b", text)
     lines = [line for line in text[head.end() if head else 0 :].splitlines() if line.strip()]
     sizes = lines[0].split() if lines else []
@@ -139,7 +140,7 @@ class ObjText:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._text = re.sub(r"\\\r?\n", " ", path.read_bytes().decode("utf-8", "replace"))
+        self._text = decoded(path.read_bytes()).replace("\\\n", " ")
         listed, starts = self.records("v")
         if not len(starts):
             raise InputError(f"{path}: v: no vertex lines in it; check that it is an OBJ file")

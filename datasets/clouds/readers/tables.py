@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....neural_fields import InputError
-from ...files import DAMAGED_ARRAYS, numeric, read_arrays
+from ...files import DAMAGED_ARRAYS, decoded, numeric, read_arrays
 from ..point_cloud import PointCloud
 from .columns import Table, TableStream, choose_layout, cloud_from, named_layout, sampled
 
@@ -24,11 +24,10 @@ def read_text(path: Path, columns: str | None = None) -> PointCloud:
     A line before the numbers may name the columns (see `choose_layout`). The counts of points in PTS files are skipped.
     """
     data = path.read_bytes()
-    wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-    if b"\0" in data and not wide:
+    text = decoded(data)
+    if "\0" in text:
         raise InputError(f"{path}: holds binary data, not text; check its extension")
-    text = data.decode("utf-16" if wide else "utf-8-sig", "replace")
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    lines = text.split("\n")
     heads, count, skipped = [], False, 0
     for skipped, line in enumerate(lines):  # noqa: B007 (where the loop stopped is wanted)
         words = re.split(r"[\s,;]+", _strip(line).strip(",; \t"))

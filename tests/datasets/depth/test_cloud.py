@@ -14,7 +14,7 @@ from mplicits.datasets.depth.cleaning import measure_noise
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit import depth as fit_depth_module
-from mplicits.pipelines.fit.depth import DepthInput, fit_depth
+from mplicits.pipelines.fit.depth import DepthInput, depth_cloud, fit_depth
 from mplicits.pipelines.fit.train import FitConfig
 from mplicits.pipelines.training.trainer import Interrupted
 
@@ -372,6 +372,22 @@ def test_fit_of_several_posed_depth_maps(scene, tmp_path, capsys, monkeypatch):
     from_first = cloud.points[:, 0] > 0.95
     assert np.abs(cloud.colors[from_first] * 255 - (0, 100, 200)).max() < 1e-3
     assert len(np.unique(np.rint(cloud.colors[:, 0] * 255))) == 3
+
+
+def test_depth_maps_whose_pose_is_lost_are_left_out_and_counted(scene, tmp_path):
+    poses = datasets.read_trajectory(scene / "trajectory.log")
+    for name, pose in zip(("000", "001", "002"), (poses[0], poses[1] - np.inf, poses[2]), strict=True):
+        np.savetxt(tmp_path / f"{name}.txt", pose)
+    source = DepthInput(scene / "depth", (str(scene / "camera.json"),), color=scene / "color", poses=tmp_path)
+    cloud, report = depth_cloud(source)
+    assert (report.frames, report.lost) == (2, 1)
+    assert "2 depth maps (1 without a pose left out)" in report.summary()
+    assert np.abs(np.linalg.norm(cloud.points, axis=1) - 1).max() < 1e-3
+    assert len(np.unique(np.rint(cloud.colors[:, 0] * 255))) == 2  # each map kept its own picture
+    for name in ("000", "002"):
+        np.savetxt(tmp_path / f"{name}.txt", np.full((4, 4), -np.inf))
+    with pytest.raises(InputError, match="all 3 poses are lost"):
+        depth_cloud(source)
 
 
 def test_resuming_takes_the_cloud_of_the_run(scene, tmp_path):

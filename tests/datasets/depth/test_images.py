@@ -293,6 +293,27 @@ def test_poses_of_other_programs_are_camera_to_world(tmp_path, files, names):
     assert lenses == (DepthCamera(**OURS) if names == ["7", "11"] else None,) * 2
 
 
+LOST = np.full((4, 4), -np.inf)  # as ScanNet writes it
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"poses/0.txt": text(LOST), "poses/1.txt": text(POSE)},
+        {"poses/0.txt": text([*LOST[:3], [0, 0, 0, 1]]), "poses/1.txt": text(POSE)},
+        {"a.log": f"0 0 1\n{text(LOST)}\n1 1 1\n{text(POSE)}"},
+        {"kitti.txt": text([np.full(12, np.nan), POSE[:3].ravel()])},
+        {"tum.txt": text([[0, *[np.nan] * 7], [1, *POSE[:3, 3], *QUATERNION]])},
+    ],
+    ids=["ScanNet", "with a last row", "Open3D log", "KITTI", "TUM"],
+)
+def test_lost_frames_have_no_pose(tmp_path, files):
+    paths = [write(tmp_path / name, content) for name, content in files.items()]
+    lost, found = datasets.read_trajectory(paths[0] if len(paths) == 1 else paths[0].parent)
+    assert np.isnan(lost).all()
+    assert np.abs(found - POSE).max() < 1e-8
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

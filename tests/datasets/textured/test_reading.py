@@ -256,6 +256,16 @@ def test_gltf_factor_is_light(tmp_path, grey):
     np.testing.assert_allclose(at(mesh, 0.5, 0.5), [linear_to_srgb(light)], atol=1e-6)
 
 
+def test_gltf_diffuse_colours_of_older_materials(tmp_path):
+    header, body = gltf(image=QUARTERS, factor=(1.0, 0.5, 0.25))
+    wanted = read_textured(write_gltf(tmp_path / "new.glb", header, body))
+    base = header["materials"][0].pop("pbrMetallicRoughness")
+    diffuse = {"diffuseFactor": base["baseColorFactor"], "diffuseTexture": base["baseColorTexture"]}
+    header["materials"][0]["extensions"] = {"KHR_materials_pbrSpecularGlossiness": diffuse}
+    found = read_textured(write_gltf(tmp_path / "old.glb", header, body))
+    np.testing.assert_array_equal(found.image, wanted.image)
+
+
 @pytest.mark.parametrize("kind", ["<f4", "<u2", "u1"])
 def test_gltf_vertex_colours_are_light(tmp_path, kind):
     light = np.array([(1, 0.5, 0.2, 1)] * 6)
@@ -376,12 +386,14 @@ def test_bad_files_are_one_line(tmp_path):
     write_mesh(tmp_path / "bare.ply", Mesh(SQUARE, FACES.astype(np.int32)))
     (tmp_path / "shape.stl").write_text("solid")
     (tmp_path / "nan.obj").write_text("v 0 0 0 1 0 0\nv 1 0 nan 1 0 0\nv 0 1 0 1 0 0\nf 1 2 3\n")
+    (tmp_path / "old.gltf").write_text('{"asset": {"version": "1.0"}, "meshes": {"cube": {"primitives": []}}}')
     for name, message in (
         ("gone.obj", "no such file"),
         ("shape.stl", r"\.obj, \.glb, \.gltf, \.ply"),
         ("cloud.ply", "face: there are none"),
         ("bare.ply", "neither a texture nor vertex colours"),
         ("nan.obj", "nan|not a finite number"),
+        ("old.gltf", "glTF 1 is not read"),
     ):
         with refused(tmp_path / name, message):
             read_textured(tmp_path / name)

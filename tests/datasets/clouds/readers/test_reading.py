@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from mplicits.datasets import PointCloud, read_cloud, write_cloud_ply
 from mplicits.datasets.clouds.point_cloud import unit_rows
-from mplicits.datasets.clouds.readers.reading import open_stream
+from mplicits.datasets.clouds.readers.reading import open_stream, read_mesh
 from mplicits.neural_fields import InputError
 from refusals import refused
 
@@ -145,6 +145,23 @@ def test_ply_triangle_strips(tmp_path):
     body = vertices.astype("<f4").tobytes() + np.array([len(items), *items], "<i4").tobytes()
     (tmp_path / "a.ply").write_bytes(head + body)
     assert (read_cloud(tmp_path / "a.ply").normals * vertices).sum(axis=1).min() > 0.9
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("kind", ["off", "stl", "obj"])
+def test_meshes_in_text_of_any_encoding(tmp_path, kind, end, encoding):
+    """A mark before the first word must not hide it: without its first vertex, an OBJ would be another shape."""
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    text = mesh.export(file_type="stl_ascii" if kind == "stl" else kind)
+    if kind == "obj":
+        text = text[text.index("v ") :]
+    path = tmp_path / f"ball.{kind}"
+    path.write_bytes(end.join(text.splitlines()).encode(encoding))
+    found, faces = read_mesh(path)
+    assert len(found) == len(mesh.vertices)
+    corners = found.points[faces] - mesh.vertices[mesh.faces]
+    assert np.abs(corners).max() < 1e-6
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
