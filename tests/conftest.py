@@ -1,11 +1,11 @@
-"""Device and dtype fixtures. A stand-in takes the place of a GPU where there is no CUDA."""
+"""Device and dtype fixtures. A fake accelerator takes the place of a GPU where there is no CUDA."""
 
 import os
 import signal
 from importlib.util import find_spec
 
+import fake_accelerator
 import pytest
-import standin
 import torch
 
 if not torch.cuda.is_available():
@@ -16,9 +16,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # So a shell starts what is in the background. Tests send Ctrl-C to themselves and to children, which inherit this.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-ACCELERATORS = [standin.NAME if standin.AVAILABLE else "cuda"]
-# What counts on the stand-in, or is about it.
-collect_ignore = [] if standin.AVAILABLE else ["test_standin.py", "test_waits.py"]
+ACCELERATORS = [fake_accelerator.NAME if fake_accelerator.AVAILABLE else "cuda"]
+# Tests that need the fake accelerator.
+collect_ignore = [] if fake_accelerator.AVAILABLE else ["test_fake_accelerator.py", "test_waits.py"]
 
 
 @pytest.fixture(params=["cpu", *ACCELERATORS])
@@ -43,9 +43,10 @@ def _seed() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the stand-in in float64: it computes on the CPU, so that only its refusals say something new."""
+    """Leave out the fake accelerator in float64: it computes on the CPU, so that only its errors differ."""
     params = {item: item.callspec.params for item in items if hasattr(item, "callspec")}
-    again = {i for i, p in params.items() if (p.get("device"), p.get("dtype")) == (standin.NAME, torch.float64)}
+    fake = (fake_accelerator.NAME, torch.float64)
+    again = {i for i, p in params.items() if (p.get("device"), p.get("dtype")) == fake}
     config.hook.pytest_deselected(items=list(again))
     items[:] = [item for item in items if item not in again]
 

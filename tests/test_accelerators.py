@@ -1,6 +1,6 @@
 """Everything that evaluates or trains gives on an accelerator what it gives on the CPU.
 
-Equal to the last bit on the stand-in; on CUDA, which rounds otherwise, finite results of the same shape.
+Equal to the last bit on the fake accelerator; on CUDA, which rounds otherwise, finite results of the same shape.
 """
 
 from collections.abc import Callable, Sequence
@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import fake_accelerator
 import mplicits.neural_fields as nf
 import numpy as np
 import pytest
-import standin
 import torch
 from evolutions import few_points
 from fields import small_multiscale, small_spacetime, two_levels
@@ -52,7 +52,7 @@ def same(work: Callable[[torch.device], Result], accelerator: torch.device) -> N
     for a, b in zip(here, there, strict=True):
         a, b = torch.as_tensor(a).detach(), torch.as_tensor(b).detach().cpu()
         assert a.shape == b.shape
-        if accelerator.type == standin.NAME:
+        if accelerator.type == fake_accelerator.NAME:
             assert torch.equal(a.nan_to_num(nan=-9.0), b.nan_to_num(nan=-9.0))
         elif a.is_floating_point():
             assert torch.equal(a.isfinite(), b.isfinite())

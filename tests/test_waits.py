@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+import fake_accelerator
 import pytest
-import standin
 import torch
 import waits
 from mplicits.neural_fields import Sphere
@@ -30,7 +30,7 @@ def test_cones_are_looked_at_once_for_each_size_of_tiles() -> None:
     field, origin = Sphere(radius=0.5), torch.tensor([0.0, 0.0, -2.2])
     near = cone_starts(field, origin, directions, tiles=(8, 4))
     there = [part.to(waits.DEVICE) for part in (field, origin, directions)]
-    with standin.counted() as ledger:
+    with fake_accelerator.counted() as ledger:
         ahead = cone_starts(*there, tiles=(8, 4))
     assert torch.equal(ahead.cpu(), near)
     looks = [times for (_, where), times in ledger.waits.items() if where.startswith("neural_fields/tracing/cones.py")]

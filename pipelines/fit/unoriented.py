@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...datasets import OrientedCloud
 from ...datasets.clouds.cleaning.noise import denoise, noise_deviation
-from ...datasets.clouds.cleaning.orientation import OUTER_REGION, Exterior, settle_signs
+from ...datasets.clouds.cleaning.orientation import OUTER_REGION, Exterior, solve_signs
 from ...datasets.clouds.cleaning.winding import WINDING
 from ...datasets.clouds.point_cloud import spread
 from ...neural_fields import Siren
@@ -36,7 +36,7 @@ class SignOptions:
     samples: int = 50_000
     rate: float = 2e-3
     points: float = 2.0  # weight of f = 0 at the points, in units of that of known distances
-    settled: float = 0.25  # of the steps, after which enclosed regions get their signs
+    assigned: float = 0.25  # of the steps, after which enclosed regions get their signs
     clear: float = 0.1  # mean slope of the field into a region, from which on it has a sign
     faint: float = 0.15  # mean slope at the points, below which signs stay: that of an open sheet
     contradicted: float = 0.01  # share of the places
@@ -135,7 +135,7 @@ def give_signs(
     clear = float(slope.abs().mean())
     if clear < options.faint:
         return Signs(np.zeros(len(points), bool), clear, source)
-    signs = settle_signs(points.double().numpy(), normals.double().numpy(), slope.double().numpy())
+    signs = solve_signs(points.double().numpy(), normals.double().numpy(), slope.double().numpy())
     return Signs(signs < 0, clear, source)
 
 
@@ -207,8 +207,8 @@ class _Unoriented(Objective):
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
-        if self.region is not None and done >= self.options.settled:
-            self._settle(self.region)
+        if self.region is not None and done >= self.options.assigned:
+            self._assign_signs(self.region)
             self.region = None
         at, by = (
             torch.randint(len(rows), (self.options.batch // 2,), generator=self.generator)
@@ -226,7 +226,7 @@ class _Unoriented(Objective):
         return terms, self.options.points * terms["points"] + terms["space"]
 
     @torch.no_grad()
-    def _settle(self, region: Tensor) -> None:
+    def _assign_signs(self, region: Tensor) -> None:
         """Give each enclosed region the sign of the mean of f/d in it, weighted by 1/d²."""
         value = torch.cat([self.siren.value(part) for part in self.places.split(1 << 16)])
         weight = self.distance.square().reciprocal() * (region > OUTER_REGION)

@@ -1,4 +1,4 @@
-"""How often an accelerator keeps the host waiting, on the stand-in: ``python tests/helpers/waits.py``.
+"""How often an accelerator keeps the host waiting, on the fake accelerator: ``python tests/helpers/waits.py``.
 
 A row is one workload, per pass, picture, call or training step. With ``--where``, the lines that wait most.
 """
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
-import standin
+import fake_accelerator
 import torch
 from mplicits.datasets import sample_torus, write_cloud_ply
 from mplicits.datasets.cameras import look_at
@@ -28,7 +28,7 @@ from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.training.trainer import Trainer
 from torch import Tensor
 
-DEVICE = torch.device(standin.NAME)
+DEVICE = torch.device(fake_accelerator.NAME)
 FIT = "--widths 16 16 16 --depths 1 1 1 --omegas 5 10 20 --steps 40 20 20 --learning-rates 1e-2 1e-3 1e-3"
 FIT += " --batch 128 --samples 500 --quiet"
 RECONSTRUCT = "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --color-grid 8 --steps 20 --rays 16"
@@ -42,7 +42,7 @@ class Row:
     name: str
     unit: str
     count: int
-    ledger: standin.Ledger
+    ledger: fake_accelerator.Ledger
 
     def __str__(self) -> str:
         waits, kernels = (part / self.count for part in (self.ledger.synchronisations, self.ledger.kernels))
@@ -83,7 +83,7 @@ def tracing(count: int = 500) -> Row:
     """One trace of ``count`` rays; its unit is a pass: an evaluation of all rays under way."""
     field = three_levels().to(DEVICE)
     origins, directions = (part.to(DEVICE) for part in some_rays(count))
-    with passes_of(MultiscaleSDF) as asked, standin.counted() as ledger:
+    with passes_of(MultiscaleSDF) as asked, fake_accelerator.counted() as ledger:
         sphere_trace(field, origins, directions)
     return Row(f"`sphere_trace`, {count} rays, three levels", "pass", len(asked), ledger)
 
@@ -92,7 +92,7 @@ def drawing(size: int = 64) -> Row:
     """The rays of one picture, tiles first, and what they see."""
     field = three_levels().to(DEVICE)
     camera = look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), fov=30.0, width=size, height=size)
-    with standin.counted() as ledger:
+    with fake_accelerator.counted() as ledger:
         trace_view(field, camera, device=DEVICE)
     return Row(f"`trace_view`, {size}², three levels", "picture", 1, ledger)
 
@@ -101,18 +101,18 @@ def evaluating(name: str, ask: Callable[[MultiscaleSDF, Tensor], object], *, fix
     """One evaluation, in fixed shapes or not."""
     field = three_levels().to(DEVICE)
     x = some_rays(1000)[0].to(DEVICE) * torch.linspace(0.2, 0.3, 1000, device=DEVICE)[:, None]
-    with standin.counted() as ledger, fixed_shapes() if fixed else contextlib.nullcontext():
+    with fake_accelerator.counted() as ledger, fixed_shapes() if fixed else contextlib.nullcontext():
         ask(field, x)
     return Row(name, "call", 1, ledger)
 
 
 @contextlib.contextmanager
-def counted_steps() -> Iterator[dict[str, list[standin.Ledger]]]:
+def counted_steps() -> Iterator[dict[str, list[fake_accelerator.Ledger]]]:
     """The counts of each training step inside the ``with``, by stage."""
     step, stages = Trainer._step, {}
 
     def watched(self: Trainer) -> object:
-        with standin.counted() as ledger:
+        with fake_accelerator.counted() as ledger:
             result = step(self)
         stages.setdefault(self.stage, []).append(ledger)
         return result
@@ -123,10 +123,10 @@ def counted_steps() -> Iterator[dict[str, list[standin.Ledger]]]:
 
 def training(words: str, name: str) -> list[Row]:
     with counted_steps() as stages, contextlib.redirect_stdout(io.StringIO()):
-        assert command([*words.split(), "--device", standin.NAME]) == 0
+        assert command([*words.split(), "--device", fake_accelerator.NAME]) == 0
     rows = []
     for stage, steps in stages.items():
-        together = standin.Ledger()
+        together = fake_accelerator.Ledger()
         for ledger in steps:
             together.waits.update(ledger.waits)
             together.launches.update(ledger.launches)

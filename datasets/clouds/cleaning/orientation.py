@@ -106,10 +106,10 @@ def orient_normals(points: Float64, normals: Float64, spread: Float64, neighbors
     return oriented, int(pieces)
 
 
-def settle_signs(
+def solve_signs(
     points: Float64, normals: Float64, evidence: Float64, *, neighbors: int = 12, weight: float = 0.2
 ) -> Float64:
-    """Signs ±1 ``(N,)`` of normals by evidence ``(N,)``, positive for the present sign, and where weak by neighbours.
+    """Signs ±1 ``(N,)`` of normals from evidence ``(N,)``, positive for the present sign; neighbours decide weak cases.
 
     Minimises ``Σ_ij |c_ij|^8 (s_i − sgn(c_ij) s_j)² + λ Σ_i |e_i| (s_i − sgn(e_i))²``, with c of `_agreement`, λ =
     ``weight`` and e in units of its median (Grady, "Random walks for image segmentation", 2006).

@@ -6,8 +6,8 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+import fake_accelerator
 import pytest
-import standin
 import torch
 from mplicits.neural_fields import Siren
 from mplicits.neural_fields.backend.devices import LEAST_BLOCKS, LEAST_ROWS, one_thread, over_blocks, split_operations
@@ -46,12 +46,12 @@ def test_every_row_is_in_one_block(rows: int, size: int, threads: int) -> None:
     assert len(names) <= max(1, threads)
 
 
-@standin.needed
+@fake_accelerator.needed
 def test_an_accelerator_is_given_as_much_as_it_may_have_at_once() -> None:
     """A CPU gets a block for each of its cores; elsewhere each block would be launches of its own."""
     rows = 20 * LEAST_ROWS
     assert len(recorded(rows, rows, torch.empty(0))[0]) > 1
-    assert recorded(rows, rows, torch.empty(0, device=standin.NAME))[0] == [slice(0, rows)]
+    assert recorded(rows, rows, torch.empty(0, device=fake_accelerator.NAME))[0] == [slice(0, rows)]
 
 
 def step_of(network: Siren, x: Tensor) -> list[Tensor]:

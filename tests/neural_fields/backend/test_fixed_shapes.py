@@ -2,8 +2,8 @@
 
 import copy
 
+import fake_accelerator
 import pytest
-import standin
 import torch
 from bounds import assert_within, rounding
 from fields import cube, small_multiscale, small_spacetime
@@ -89,16 +89,16 @@ def test_few_points(count: int) -> None:
 
 
 def assert_no_wait(field: Field, x: Tensor, capacity: list[int] | None) -> dict[str, int]:
-    """On the stand-in → its launches."""
-    field, x = copy.deepcopy(field).to(standin.NAME), x.to(standin.NAME)
-    with standin.counted() as book, fixed_shapes(capacity):
+    """Launches on the fake accelerator."""
+    field, x = copy.deepcopy(field).to(fake_accelerator.NAME), x.to(fake_accelerator.NAME)
+    with fake_accelerator.counted() as book, fixed_shapes(capacity):
         field.value(x)
         field.jet(x)
     assert book.synchronisations == 0, book.report()
     return book.launches
 
 
-@standin.needed
+@fake_accelerator.needed
 @pytest.mark.parametrize("capacity", [None, [50, 20]])
 def test_no_wait_and_the_same_kernels_for_any_points(capacity: list[int] | None) -> None:
     near, far = (assert_no_wait(sdf(), reach * cube(400), capacity) for reach in (1, 3))
@@ -114,7 +114,7 @@ def composed(name: str) -> Field:
 
 
 @pytest.mark.parametrize("capacity", [None, [60, 20]])
-@standin.needed
+@fake_accelerator.needed
 @pytest.mark.parametrize("name", ["union", "slice"])
 def test_fields_of_fields_need_no_wait_either(name: str, capacity: list[int] | None) -> None:
     field, x = composed(name), cube(400)

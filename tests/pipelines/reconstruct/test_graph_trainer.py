@@ -4,8 +4,8 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from functools import partial
 
+import fake_accelerator
 import pytest
-import standin
 import torch
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields.backend.devices import GraphInputs
@@ -93,7 +93,7 @@ def test_the_host_never_waits_for_a_replayed_step(name: str, images: PosedImages
         return
     for step in range(there.steps):
         recorded = there.graphs.recorded
-        with standin.counted() as book:
+        with fake_accelerator.counted() as book:
             there._step()
         if step % 16 not in (0, 15) and there.graphs.recorded == recorded:
             assert book.synchronisations == 0 or step < 2, (step, book.report())

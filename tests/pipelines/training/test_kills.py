@@ -168,7 +168,7 @@ def test_a_training_killed_at_any_operation_ends_with_the_same_bits(
         run = tmp_path / f"{at}"
         with Faults(at).injected(), pytest.raises(Killed):
             begin(run, False)
-        runs.is_fitted(run)  # settles
+        runs.is_fitted(run)  # recovers
         if (run / state).is_file() or not (run / result).is_file():
             begin(run, (run / state).is_file())
         torch.testing.assert_close(load_file(run / result), wanted, rtol=0, atol=0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from mplicits.datasets import sample_sphere
-from mplicits.datasets.clouds.cleaning.orientation import OUTER_REGION, Exterior, settle_signs
+from mplicits.datasets.clouds.cleaning.orientation import OUTER_REGION, Exterior, solve_signs
 
 PLACES = np.array([[0.0, 0, 0], [0.35, 0, 0], [0.0, 0, 0.95], [-1.1, 1.1, 1.1]])
 
@@ -13,7 +13,7 @@ def test_signs_walk_from_where_evidence_is() -> None:
     random = np.random.default_rng(0)
     wrong = random.choice([-1.0, 1.0], 5000)
     evidence = np.where(random.uniform(size=5000) < 0.6, wrong, 1e-6)
-    assert (settle_signs(points, 2 * points * wrong[:, None], evidence) == wrong).mean() > 0.99  # evidence alone: 0.8
+    assert (solve_signs(points, 2 * points * wrong[:, None], evidence) == wrong).mean() > 0.99  # evidence alone: 0.8
 
 
 def test_evidence_outvotes_its_neighbours_where_it_is_strong() -> None:
@@ -21,8 +21,8 @@ def test_evidence_outvotes_its_neighbours_where_it_is_strong() -> None:
     points = sample_sphere(5000, radius=0.5).points
     evidence = np.ones(5000)
     evidence[:50] = -1.0  # single contradictions among thousands of equal weight
-    assert (settle_signs(points, 2 * points, evidence, weight=0.2) == 1).all()
-    assert (settle_signs(points, 2 * points, evidence, weight=100.0) == evidence).all()
+    assert (solve_signs(points, 2 * points, evidence, weight=0.2) == 1).all()
+    assert (solve_signs(points, 2 * points, evidence, weight=100.0) == evidence).all()
 
 
 def test_a_closed_surface_encloses_what_is_in_it() -> None:

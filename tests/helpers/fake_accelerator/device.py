@@ -1,4 +1,4 @@
-"""A stand-in accelerator: it keeps its numbers on the CPU, computes there, and refuses what a GPU would refuse.
+"""A fake accelerator: it stores and computes on the CPU, and raises the errors that a GPU raises.
 
 PyTorch lends a device type to backends ("PrivateUse1"); here it is ``standin``. Its tensors are shells of tensors of
 the CPU, so that results are the CPU's to the last bit. Each operation on shells comes to `_run`, which counts launches
@@ -36,13 +36,13 @@ TAKE_NUMBERS = {"where", "masked_fill", "masked_fill_", "fill", "fill_", "lerp",
 BY_NAME = ("copy_", "fill_.Scalar", "detach", "_to_copy")
 
 
-class StandInTensor(Tensor):
+class FakeAcceleratorTensor(Tensor):
     """The shell of a tensor of the CPU, ``inner``, which it shares with its views."""
 
     inner: Tensor
 
     @staticmethod
-    def __new__(cls, inner: Tensor) -> StandInTensor:
+    def __new__(cls, inner: Tensor) -> FakeAcceleratorTensor:
         shell = Tensor._make_wrapper_subclass(
             cls, inner.shape, inner.stride(), inner.storage_offset(), dtype=inner.dtype, device=f"{NAME}:0"
         )
@@ -76,12 +76,12 @@ class StandInTensor(Tensor):
     @data.setter
     def data(self, other: Tensor) -> None:
         Tensor.data.__set__(self, other)
-        assert isinstance(other, StandInTensor)
+        assert isinstance(other, FakeAcceleratorTensor)
         self.inner = other.inner
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Tensor:
         # torch's own copies the storage of a tensor with an address, and a shell has none.
-        copied = StandInTensor(self.inner.detach().clone()).requires_grad_(self.requires_grad)
+        copied = FakeAcceleratorTensor(self.inner.detach().clone()).requires_grad_(self.requires_grad)
         copied.__dict__.update({name: value for name, value in self.__dict__.items() if name != "inner"})
         memo[id(self)] = copied
         return copied
@@ -141,8 +141,8 @@ def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
     if operation.written:
         back = [_argument(args, kwargs, place) for place in operation.written]
         for shell in back:
-            if isinstance(shell, StandInTensor) and shell.shape != shell.inner.shape:
-                shell.data = StandInTensor(shell.inner)  # it was squeezed, or it was to be as large as its content
+            if isinstance(shell, FakeAcceleratorTensor) and shell.shape != shell.inner.shape:
+                shell.data = FakeAcceleratorTensor(shell.inner)  # it was squeezed or resized
         return back[0] if len(back) == 1 else tuple(back)
     target = kwargs.get("device")
     return result if target is not None and torch.device(target).type != NAME else _shelled(result)
@@ -170,12 +170,12 @@ def _note_copy(name: str, args: Any, kwargs: Any) -> None:
     if name == "copy_":
         target, source = args[:2]
         asked = args[2] if len(args) > 2 else kwargs.get("non_blocking", False)
-        down, up = not isinstance(target, StandInTensor), not isinstance(source, StandInTensor)
+        down, up = not isinstance(target, FakeAcceleratorTensor), not isinstance(source, FakeAcceleratorTensor)
     else:
         device, source = kwargs.get("device"), args[0]
         asked = kwargs.get("non_blocking", False)
         down = device is not None and torch.device(device).type != NAME
-        up = not isinstance(source, StandInTensor)
+        up = not isinstance(source, FakeAcceleratorTensor)
     if down and asked:
         raise RuntimeError("non_blocking copy to the host: it may be read before it is there")
     if down or (up and not (asked and _is_pinned(source))):
@@ -195,7 +195,7 @@ def _note(operation: _Operation, args: Any, kwargs: Any) -> None:
     elif name in INDEXED:
         indices = [index for index in args[1] if index is not None]
         for index in indices:
-            if not isinstance(index, StandInTensor):
+            if not isinstance(index, FakeAcceleratorTensor):
                 note_wait("upload")
         masks = [index for index in indices if index.dtype in (torch.bool, torch.uint8)]
         # One mask and one number: that is a masked fill, whose size does not matter.
@@ -211,7 +211,7 @@ def _counts_unknown(args: Any, kwargs: Any) -> bool:
 def _opened(value: Any, hosts: list[Tensor]) -> Any:
     """What the device sees as its own: inner tensors, and its name as the CPU's. Tensors of the host join ``hosts``."""
     kind = type(value)
-    if kind is StandInTensor:
+    if kind is FakeAcceleratorTensor:
         return value.inner
     if kind in PLAIN:
         return value
@@ -231,8 +231,8 @@ def _shelled(result: Any) -> Any:
         # What is seen of an ordinary tensor in inference mode is an ordinary tensor.
         if torch.is_inference_mode_enabled() and not result.is_inference():
             with torch.inference_mode(False):
-                return StandInTensor(result)
-        return StandInTensor(result)
+                return FakeAcceleratorTensor(result)
+        return FakeAcceleratorTensor(result)
     return type(result)(map(_shelled, result)) if isinstance(result, list | tuple) else result
 
 

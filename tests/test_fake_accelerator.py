@@ -1,17 +1,17 @@
-"""The stand-in accelerator: that it refuses, counts exactly, and changes no bit."""
+"""The fake accelerator raises a GPU's errors, counts exactly, and changes no bit."""
 
 import copy
 import io
 
+import fake_accelerator
 import numpy as np
 import pytest
-import standin
 import torch
 from fields import small_multiscale
 from mplicits.neural_fields import Sphere
 from torch import Tensor
 
-DEVICE = torch.device(standin.NAME)
+DEVICE = torch.device(fake_accelerator.NAME)
 
 
 def on_device(*shape: int) -> Tensor:
@@ -21,8 +21,8 @@ def on_device(*shape: int) -> Tensor:
 def test_numbers_go_there_and_come_back() -> None:
     x = torch.rand(4, 3)
     there = x.to(DEVICE)
-    assert isinstance(there, standin.StandInTensor)
-    assert (there.device, there.is_cpu) == (torch.device(standin.NAME, 0), False)
+    assert isinstance(there, fake_accelerator.FakeAcceleratorTensor)
+    assert (there.device, there.is_cpu) == (torch.device(fake_accelerator.NAME, 0), False)
     assert type(there.cpu()) is Tensor
     assert there.cpu().equal(x)
     assert (there.tolist(), there[1, 2].item()) == (x.tolist(), x[1, 2].item())
@@ -64,7 +64,7 @@ def test_operands_on_two_devices_are_refused(mixed: object) -> None:
 def test_numbers_of_the_host_are_taken() -> None:
     x, two = on_device(3), torch.tensor(2.0)
     for result in (x * two, two * x, torch.where(x > 2, two, x), torch.maximum(x, two), x.masked_fill(x < 2, two)):
-        assert result.device.type == standin.NAME
+        assert result.device.type == fake_accelerator.NAME
     assert x[torch.tensor([2, 0])].tolist() == [x[2].item(), x[0].item()]
 
 
@@ -127,7 +127,7 @@ def test_waits_are_counted(why: str, times: int, ask: object, inference: bool) -
     """In inference mode as well, where operations come to a device before they are taken apart."""
     with torch.inference_mode(inference):
         x = torch.ones(3).to(DEVICE)
-        with standin.counted() as book:
+        with fake_accelerator.counted() as book:
             ask(x)
     assert {name for name, _ in book.waits} == ({why} if times else set()), book.report()
     assert book.synchronisations == times
@@ -135,25 +135,25 @@ def test_waits_are_counted(why: str, times: int, ask: object, inference: bool) -
 
 def test_launches_are_counted_and_views_are_none() -> None:
     x = on_device(4, 3)
-    with standin.counted() as book:
+    with fake_accelerator.counted() as book:
         (x.t()[1:].reshape(2, 4).expand(2, 2, 4)[..., None].detach().sin() + 1).sum()
         torch.empty(3, device=DEVICE)
         torch.zeros(3, device=DEVICE).add_(1)
     assert book.launches == {"sin": 1, "add": 1, "sum": 1, "zero_": 1, "add_": 1}
-    with standin.counted() as outer:
+    with fake_accelerator.counted() as outer:
         x.sin()
-        with standin.counted() as inner:
+        with fake_accelerator.counted() as inner:
             x.cos()
     assert (outer.kernels, inner.kernels) == (2, 1)
 
 
 def test_waits_name_the_line_that_asked() -> None:
-    with standin.counted() as book:
+    with fake_accelerator.counted() as book:
         on_device(3)[0].item()
-    assert [where.split(":")[0] for _, where in book.waits] == ["test_standin.py"] * 2
+    assert [where.split(":")[0] for _, where in book.waits] == ["test_fake_accelerator.py"] * 2
     field = small_multiscale().to(DEVICE)
     x = on_device(50, 3)
-    with standin.counted() as book:
+    with fake_accelerator.counted() as book:
         field.value(x)
     # Each residual is evaluated at the rows of its band, whose number the host has to know.
     (wait,) = [(why, where.split(":")[0]) for why, where in book.waits]
@@ -164,7 +164,7 @@ def test_waits_name_the_line_that_asked() -> None:
 def test_modules_and_their_gradients() -> None:
     here = torch.nn.Sequential(torch.nn.Linear(3, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1))
     there = copy.deepcopy(here).to(DEVICE)
-    assert all(isinstance(p, torch.nn.Parameter) and p.device.type == standin.NAME for p in there.parameters())
+    assert all(isinstance(p, torch.nn.Parameter) and p.device.type == fake_accelerator.NAME for p in there.parameters())
     x = torch.rand(10, 3)
     for model, points in ((here, x), (there, x.to(DEVICE))):
         optimiser = torch.optim.Adam(model.parameters())
