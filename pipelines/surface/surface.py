@@ -286,10 +286,8 @@ def thinned(points: NDArray[np.floating], *, visible_within: float | None = None
     ``visible_within``: distance from some point up to which the surface counts as visible.
     """
     kept = points[voxel_representatives(np.asarray(points, np.float64), SUPPORT_VOXEL)]
-    tensors = {"points": torch.from_numpy(kept).half()}
-    if visible_within is not None:
-        tensors["seen_within"] = torch.tensor(float(np.hypot(visible_within, SUPPORT_VOXEL)))
-    return tensors
+    reach = None if visible_within is None else torch.tensor(float(np.hypot(visible_within, SUPPORT_VOXEL)))
+    return {"points": torch.from_numpy(kept).half()} | ({} if reach is None else {"seen_within": reach})
 
 
 def visible_part(mesh: Mesh, support: Support) -> tuple[Mesh | None, float]:
