@@ -18,7 +18,7 @@ import pytest
 import torch
 from mplicits import neural_fields
 from mplicits.neural_fields import upward
-from mplicits.neural_fields.backend.devices import environment
+from mplicits.pipelines.training.scaffold import environment
 
 ROOT = Path(__file__).parent.parent
 # From the ground up. A room imports from those above it in this list, never from those below.

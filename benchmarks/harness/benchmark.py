@@ -18,8 +18,9 @@ from typing import Any, ClassVar, Generic, TypeVar, Union, get_args, get_origin,
 
 import torch
 from mplicits.neural_fields import InputError
-from mplicits.neural_fields.backend.devices import choose_device, environment, sgemm_rate
+from mplicits.neural_fields.backend.devices import choose_device, sgemm_rate
 from mplicits.neural_fields.backend.files import write_json, write_whole
+from mplicits.pipelines.training.scaffold import environment
 
 from .jobs import Context, Method, Record, Registry, Results, make_folder
 from .report import Section, as_csv, as_dict, as_page

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
-from mplicits.neural_fields.backend.devices import choose_device, environment
+from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.pipelines.training.jobs import Outcome, check_jobs, run_jobs, run_streams
+from mplicits.pipelines.training.scaffold import environment
 from mplicits.pipelines.training.trainer import Interrupted, Report
 
 from .jobs import Context, Job, Record, Registry, read_record, write_record

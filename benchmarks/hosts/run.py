@@ -1,4 +1,4 @@
-"""Trains NeuS or instant-nsr-pl as it is, and by the lines of docs/drop-in.md; prints what each cost and gave.
+"""Trains NeuS or instant-nsr-pl unchanged, and with the lines of docs/drop-in.md; prints costs and errors.
 
     python -m benchmarks.hosts.run --neus path/to/NeuS --data path/to/dtu_scan24 --steps 240 --rays 64 --seeds 0 1 2
 

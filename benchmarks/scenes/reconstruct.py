@@ -15,7 +15,7 @@ import numpy as np
 from mplicits.datasets.synthetic.scenes import SCENES, Scene, render_scene, scene_mesh
 from mplicits.datasets.views.images import PosedImage, PosedImages, read_posed_images
 from mplicits.neural_fields import InputError, Mesh, NoSurfaceError
-from mplicits.neural_fields.backend.devices import choose_device, environment
+from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.neural_fields.meshing.extract import extract_mesh
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.pipelines.mesh.files import write_mesh
@@ -25,6 +25,7 @@ from mplicits.pipelines.render.picture import Image, contact_sheet, write_pictur
 from mplicits.pipelines.surface.measure import Metrics, evaluate_surfaces
 from mplicits.pipelines.surface.surface import in_region, keep_largest
 from mplicits.pipelines.training.folder import digest_of
+from mplicits.pipelines.training.scaffold import environment
 from mplicits.pipelines.training.settings import ReconstructConfig, closest
 from mplicits.pipelines.training.trainer import Interrupted, Progress, parameter_count, stop_on_signals
 

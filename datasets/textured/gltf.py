@@ -78,12 +78,14 @@ class _Document:
     @classmethod
     def load(cls, path: Path) -> _Document:
         data = path.read_bytes()
-        header = json.loads(data) if data[:4] != b"glTF" else None
-        old = struct.unpack_from("<I", data, 4)[0] != 2 if header is None else isinstance(header.get("meshes"), dict)
-        if old:  # its meshes have names, and no numbers
-            raise InputError(f"{path}: glTF 1 is not read; export it as glTF 2")
-        if header is not None:
+        older = InputError(f"{path}: glTF 1 is not read; export it as glTF 2")
+        if data[:4] != b"glTF":
+            header = json.loads(data)
+            if isinstance(header.get("meshes"), dict):  # glTF 2 has a list
+                raise older
             return cls(path, header, b"")
+        if struct.unpack_from("<I", data, 4)[0] != 2:
+            raise older
         whole, length = struct.unpack_from("<I", data, 8)[0], struct.unpack_from("<I", data, 12)[0]
         if len(data) < whole:
             raise InputError(f"{path}: is cut off after {len(data):,} of {whole:,} bytes; copy or export it again")

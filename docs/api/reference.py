@@ -125,7 +125,7 @@ def formats_page() -> str:
 def _about(function: Callable[..., Any]) -> str:
     """A docstring without its sections of arguments and errors, as Markdown."""
     text = re.split(r"\n(?:Args|Returns|Raises|Example):\n", inspect.getdoc(function) or "")[0]
-    return re.sub(r"`([^`\n]+)`", r"`\1`", text.replace("``", "`")).strip()
+    return text.replace("``", "`").strip()
 
 
 def _list(words: tuple[str, ...]) -> str:

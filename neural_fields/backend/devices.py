@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import functools
-import importlib.metadata
 import os
-import platform
 import sys
 import threading
 import time
@@ -302,8 +300,6 @@ if hasattr(os, "register_at_fork"):
 # report what its parent held when it was born.
 STATUS = Path("/proc/self/status")
 
-_version = functools.cache(importlib.metadata.version)  # it reads files, and every record of a run asks
-
 
 def best_seconds(work: Callable[[], object], *, repeats: int = 5, median: bool = False) -> float:
     """Least wall-clock seconds of ``repeats`` calls after a warm-up: other processes can only make a run slower.
@@ -362,16 +358,3 @@ def choose_device(name: str, *, option: str = "--device") -> torch.device:
         reason = str(error).splitlines()[0]
         raise InputError(f"{option} {name}: not usable here ({reason}); use auto or cpu") from error
     return device
-
-
-def environment(device: torch.device) -> dict[str, Any]:
-    """What the figures of a run depend on: versions, threads, machine."""
-    names = ("mplicits", "torch", "numpy", "scipy", "safetensors")
-    return {
-        "versions": {name: _version(name) for name in names},
-        "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}",
-        "cpu_count": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
-    }

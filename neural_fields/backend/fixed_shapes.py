@@ -116,8 +116,9 @@ def chosen(name: str, mask: Tensor) -> Rows:
     shapes = current_shapes()
     if shapes is None:
         return Rows(mask.nonzero()[:, 0], len(mask), full=True)
-    shapes.named_requested[name], count = mask.sum(), len(mask)
-    return Rows(first_rows(mask, min(shapes.named_capacity.get(name, count), count)), count, full=False)
+    shapes.named_requested[name] = mask.sum()
+    capacity = min(shapes.named_capacity.get(name, len(mask)), len(mask))
+    return Rows(first_rows(mask, capacity), len(mask), full=False)
 
 
 _shapes: ContextVar[FixedShapes | None] = ContextVar("shapes", default=None)

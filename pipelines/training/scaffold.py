@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import importlib.metadata
 import math
+import os
+import platform
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+import torch
 from torch import Tensor, nn
 
 from ...neural_fields import Field, Similarity
-from ...neural_fields.backend.devices import choose_device, environment
+from ...neural_fields.backend.devices import choose_device
 from .folder import RunFolder
 from .progress import Report
 from .settings import TrainingSettings
@@ -260,3 +265,19 @@ class Training(ABC, Generic[C, F]):
     def timed_step(self, level: int) -> Callable[[], Tensor]:
         """The loss of a level in a training step, on networks that are not trained."""
         raise NotImplementedError(f"{type(self).__name__} has no levels")
+
+
+_version = functools.cache(importlib.metadata.version)  # it reads files, and every checkpoint has a record
+
+
+def environment(device: torch.device) -> dict[str, Any]:
+    """What the figures of a run depend on: versions, threads, machine."""
+    names = ("mplicits", "torch", "numpy", "scipy", "safetensors")
+    return {
+        "versions": {name: _version(name) for name in names},
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "cpu_count": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
+    }

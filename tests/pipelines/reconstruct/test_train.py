@@ -331,7 +331,7 @@ def test_colours_of_the_surface_are_without_highlights() -> None:
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)))[0]
     eyes = 2 * torch.from_numpy(fibonacci_directions(40)).float() @ turn.T
     order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
-    wrong, ahead = (  # of which the second has no three eyes
+    wrong, ahead = (  # the second has fewer than three eyes
         (surface_colors(model, points, some) - 0.3 - 0.4 * points).abs().amax(dim=1) for some in (eyes[order], eyes[:2])
     )
     assert float(ahead.max()) > 0.45  # the highlight, head-on
