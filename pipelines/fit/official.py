@@ -30,7 +30,7 @@ from .samples import delta_of
 
 STAGES = ("coarse", "medium", "fine")  # their names of the levels, and of the folders
 WEIGHTS_FILE = "best.pth"
-FRAME_FILE = "mplicits.json"  # what their format has no place for: bands, taper, input coordinates
+FRAME_FILE = "frame.json"  # what their format has no place for: bands, taper, input coordinates
 FIXED_BAND = 0.1  # half-width of their fixed coarse band (`reconstruct.py`), in units of the sphere: the widest
 
 
@@ -48,7 +48,7 @@ class Official(NamedTuple):
     Attributes:
         field: its levels, in unit-sphere coordinates.
         similarity: from input coordinates; the identity unless the folder has one.
-        points: of the cloud that gave the bands, ``(N, 3)``; None without one.
+        points: of the cloud that gave the bands, ``(N, 3)`` in those coordinates; None without one.
         inside_out: whether level 0 is negative at most corners of the cube [−1, 1]³.
     """
 
@@ -153,7 +153,9 @@ def read_official(
     if negate:
         for tensor in (part for level in levels for part in level.output.parameters()):
             tensor.neg_()
-    points = None if cloud is None else torch.from_numpy(read_cloud(cloud).points).float()
+    points = None
+    if cloud is not None:
+        points = torch.from_numpy(frame.similarity.to_unit(read_cloud(cloud).points)).float()
     widths = frame.deltas if deltas is None and cloud is None else deltas
     if widths is not None and (len(widths) != len(levels) - 1 or not all(0 < width < math.inf for width in widths)):
         raise InputError(f"--deltas {' '.join(map(str, widths))}: expected {len(levels) - 1}, each > 0; one per band")

@@ -286,8 +286,8 @@ def test_what_is_missing_is_named(networks: list[nn.Sequential], tmp_path: Path)
         read_official(model, cloud=tmp_path / "far.ply")
     with refused("ball", "mplicits import"):
         find_field(model)
-    (model / "mplicits.json").write_text('{"deltas": 3}')
-    with refused("mplicits.json", "remove it"):
+    (model / "frame.json").write_text('{"deltas": 3}')
+    with refused("frame.json", "remove it"):
         read_official(model, deltas=DELTAS)
     (model / "medium" / "best.pth").unlink()
     with refused("medium", "no such file"):
