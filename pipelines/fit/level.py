@@ -165,11 +165,15 @@ class Verdict(NamedTuple):
     def better(self) -> bool:
         """Whether the level is kept: one error is significantly less and the other not more, or the level `learns`.
 
-        An angle to estimated normals never counts against a level.
+        An angle to estimated normals never counts against a level. Nor does a distance, if the angle to given normals
+        falls by the larger factor: smoothing has moved the held-out points, and rounded them, but not their normals.
         """
-        against = self.fall.distance if self.guessed else min(self.fall)
-        sure = max(self.fall) > JUDGE.surely and against > -JUDGE.surely
-        return sure or self.learns
+        distance, angle = (fall > -JUDGE.surely for fall in self.fall)
+        if self.guessed:
+            angle = True
+        else:
+            distance |= self.after.distance * self.after.angle < self.before.distance * self.before.angle
+        return (max(self.fall) > JUDGE.surely and distance and angle) or self.learns
 
     @property
     def learns(self) -> bool:

@@ -138,6 +138,10 @@ def reconstruct(
         return training.run()
 
 
+def _pixels(view: PosedImage) -> int:
+    return view.color.shape[0] * view.color.shape[1]
+
+
 class _Reconstruction(Training[ReconstructConfig, Field]):
     """One reconstruction under way."""
 
@@ -198,16 +202,19 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
 
     def picture_seconds(self, left: float) -> float:
         """Seconds for the held-out views and the texture, from the time of a small picture and a few steps."""
-        seconds, views = 0.0, self.test_views
-        if views:
-            started, small = time.monotonic(), reduced(views[0], FINISH.timed_pixels)
-            self._image(small, level=-1)
-            pixels = sum(view.color.shape[0] * view.color.shape[1] for view in views)
-            seconds += (time.monotonic() - started) * pixels / (small.color.shape[0] * small.color.shape[1])
+        seconds = 0.0
+        if self.test_views:
+            seconds += self._pixel_seconds() * sum(map(_pixels, self.test_views))
         if self.config.texture_steps:
             step = texture_step_seconds(texture_settings(self.config), self.device, left)
             seconds += FINISH.texture_factor * self.config.texture_steps * step
         return seconds
+
+    def _pixel_seconds(self) -> float:
+        """Seconds for a pixel of a held-out view, at the finest level, from a small picture."""
+        started, small = time.monotonic(), reduced(self.test_views[0], FINISH.timed_pixels)
+        self._image(small, level=-1)
+        return (time.monotonic() - started) / _pixels(small)
 
     def surface_seconds(self) -> float:
         """Seconds for the visibility test and for the meshes, measured on one view and a coarse mesh."""
@@ -289,19 +296,22 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         return image if self.model.exposures is None else exposed_as(image, view, self.model.background)
 
     def _render_held_out(self) -> list[tuple[PosedImage, ViewImage]]:
-        pairs, count, limit = [], len(self.test_views), self.left()
-        begun = time.monotonic()
+        """The held-out views and their pictures: smaller ones, where those of full size exceed a time budget."""
+        pairs, views, limit = [], spread(self.test_views), self.left()
         if self.trainer.objective.grid is not None:
             self.trainer.objective.grid.refresh(self.model.geometry)
-        if count:
-            self.report(Progress("held-out views", 0, count, 0.0, {}))
-        for index, view in enumerate(spread(self.test_views)):
+        if views and limit is not None:
             # Half of the rest of a time budget is for the texture.
-            if pairs and limit is not None and time.monotonic() - begun > limit / 2:
-                self.budget.notes.append(f"{index} of {count} held-out views are measured")
-                break
+            room = max(int(limit / 2 / len(views) / self._pixel_seconds()), FINISH.timed_pixels)
+            if room < max(map(_pixels, views)):
+                views = [reduced(view, room) for view in views]
+                height, width = views[0].color.shape[:2]
+                self.budget.notes.append(f"held-out views are measured at {width} × {height} pixels")
+        for index, view in enumerate(views):
+            self.report(Progress("held-out views", index, len(views), index / len(views), {}))
             pairs.append((view, self._image(view)))
-            self.report(Progress("held-out views", index + 1, count, (index + 1) / count, {}))
+        if views:
+            self.report(Progress("held-out views", len(views), len(views), 1.0, {}))
         return pairs
 
     def _torn(self) -> dict[str, int]:

@@ -316,6 +316,28 @@ def test_a_budget_counts_all_but_leaves_most_for_the_training(data: Path, tmp_pa
     assert record["texture"]["budget"]["seconds"] < 2.0
 
 
+def test_large_held_out_views_are_measured_small_under_a_budget(data: Path, tmp_path: Path) -> None:
+    """Two views of a megapixel would take minutes each: all are measured, at a size that the budget has room for."""
+    large = with_views(read_posed_images(data), lambda _, view: enlarged(view, 1024))
+    config = replace(TINY, texture_steps=0, time_budget=2.0)
+    record = reconstruct(large, config).record
+    assert len(record["held_out"]["views"]) == len(large.views) // TINY.test_every
+    (note,) = (note for note in record["budget"]["notes"] if "held-out views" in note)
+    width, height = map(int, re.findall(r"\d+", note))
+    assert FINISH.timed_pixels / 2 <= width * height < 1024**2 / 4
+
+
+def enlarged(view: PosedImage, size: int) -> PosedImage:
+    factor = size / view.color.shape[0]
+    camera = view.camera
+    assert camera.width == camera.height
+    lens = camera.intrinsics.clone()
+    lens[:2] *= factor
+    color = cv2.resize(view.color, (size, size))
+    mask = None if view.mask is None else cv2.resize(view.mask, (size, size))
+    return PosedImage(view.name, replace(camera, intrinsics=lens, width=size, height=size), color, mask)
+
+
 class Glossy(ColorNetwork):
     """Paint of 0.3 + 0.4 x, under a lamp that is reflected."""
 
