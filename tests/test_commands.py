@@ -120,7 +120,7 @@ def views(path: Path, *, form: str = "transforms", count: int = 4) -> None:
 
 
 def cameras(path: Path) -> None:
-    views(path.parent / "viewed", count=14)  # docs/rendering.md asks for the one with the number 12
+    views(path.parent / "viewed", count=14)  # docs/pictures.md uses number 12
     shutil.copy(path.parent / "viewed" / path.name, path)
 
 
@@ -263,7 +263,7 @@ def is_bench(line: str) -> bool:
     return line.startswith(f"{BENCHMARKS.name} ")
 
 
-LONG = ("animate", "evolve")  # pages whose lines train the most; the tour has the first of each
+LONG = ("motion",)  # the page whose lines train the most
 
 LINES = [
     pytest.param(

@@ -201,8 +201,8 @@ def _offset(arguments: argparse.Namespace) -> int:
 
 OFFSET = Command(
     "grow, shrink or hollow a fit by a length",
-    """  mplicits offset runs/scan --by 2mm --unit m -o larger.ply
-  mplicits offset runs/scan --by -0.02 --shell -o hollow.stl
+    """  mplicits offset runs/scan --by 2mm --unit mm -o larger.ply
+  mplicits offset runs/scan --by -0.02 -o smaller.ply
   mplicits offset part.stl --by -2mm --shell --unit mm -o hollow.stl""",
     _offset_arguments,
     _offset,
