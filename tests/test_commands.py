@@ -71,6 +71,7 @@ SMALLEST = {  # by what a line begins with, or holds
     "mplicits offset *": "--resolution 24",
     "mplicits offset * --shell *": "--by -0.25",  # more than two of these cells
     "mplicits scene *": "--views 3 --size 16 --samples 1",
+    "mplicits scene * -o photos *": "--views 12",  # two of them see the same place
     "python -m benchmarks reconstruct *": f"{RECONSTRUCT} --views 4 --size 16 --test-every 2 --test-views 1"
     " --no-equal-time --resolution 16 --eval-samples 500",
     "python -m benchmarks reconstruct * --geometry-only *": "--rates 1e-3 --seeds 2 --geometries neus",

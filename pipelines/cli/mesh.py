@@ -67,7 +67,7 @@ def _mesh(arguments: argparse.Namespace) -> int:
 
 MESH = Command(
     "extract a mesh from a fit",
-    """  mplicits mesh runs/scan -o scan.ply --resolution 512
+    """  mplicits mesh runs/scan -o scan_mesh.ply --resolution 512
   mplicits mesh runs/scan -o coarse.obj --level 0
   mplicits mesh runs/scan -o scan.glb --keep-largest --trim-distance 0.01
   mplicits mesh runs/scan -o scan.glb --up z --unit mm --center
@@ -111,8 +111,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 EVALUATE = Command(
     "measure a mesh against a reference",
-    """  mplicits evaluate scan.ply truth.ply
-  mplicits evaluate scan.ply points.xyz --samples 100000 --json figures.json
+    """  mplicits evaluate scan_mesh.ply truth.ply
+  mplicits evaluate scan_mesh.ply points.xyz --samples 100000 --json figures.json
   mplicits evaluate runs/statue/mesh.ply photos/surface.ply --photos photos""",
     _evaluate_arguments,
     _evaluate,
