@@ -6,12 +6,13 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ....neural_fields import InputError
+from ...files import MODEST
 from ..point_cloud import PointCloud, colors_from
 from .columns import CloudStream, Layout, RawRows, Table, describe_layout, named_layout
 
@@ -19,6 +20,7 @@ from .columns import CloudStream, Layout, RawRows, Table, describe_layout, named
 _VERSION = struct.Struct("<BB"), 24
 _SIZES = struct.Struct("<HIIBHI"), 94
 _SIZES_14 = struct.Struct("<QIQ"), 235
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of LASzip's items by their kind; extra bytes (14) have one for each byte
 
 
 class LasStream(CloudStream):
@@ -130,10 +132,10 @@ def _check_sizes(path: Path) -> None:
     if wrong:
         raise _unreadable(path, wrong)
     if compressed and points:
-        _check_laz(path, start, points)
+        _check_laz(path, start, points, length)
 
 
-def _check_laz(path: Path, start: int, points: int) -> None:
+def _check_laz(path: Path, start: int, points: int, length: int) -> None:
     """Refuse LAZ on which the decompressor would abort or loop: old compressors, and impossible chunk tables.
 
     Layout (LASzip, "laszip.hpp"): the LASzip record is one of the variable-length records. At ``start`` is the place of
@@ -158,6 +160,37 @@ def _check_laz(path: Path, start: int, points: int) -> None:
         fixed = chunk not in (0, 2**32 - 1)
         if not 0 <= chunks <= size or (fixed and chunks > points // chunk + 1) or not chunk:
             raise _unreadable(path, f"a chunk table of {chunks} chunks at byte {table}")
+        if fixed and chunk * length > max(MODEST, points * length):  # memory for whole chunks is allocated
+            raise _unreadable(path, f"chunks of {chunk} points of {points}")
+        with _reading(path):
+            _check_chunks(path, file, (start, table), head[at + 52 :], length)
+
+
+def _check_chunks(path: Path, file: BinaryIO, place: tuple[int, int], record: bytes, length: int) -> None:
+    """Refuse points, chunks or layers that are longer than what holds them: the decompressor allocates what they claim.
+
+    The LASzip record lists kinds and sizes of the items of a point. A layered chunk (compressor 3) begins with a point
+    as it is, the number of points, and the sizes of its layers.
+    """
+    try:
+        import lazrs
+    except ImportError:  # laspy then uses LASzip itself
+        return
+    (start, end), compressor = place, record[0]
+    (count,) = struct.unpack_from("<H", record, 32)
+    items = [struct.unpack_from("<HH", record, 34 + 6 * k) for k in range(count)]
+    layers = sum(_LAYERS.get(kind, size) for kind, size in items) if compressor == 3 else 0
+    if sum(size for _, size in items) != length:
+        raise _unreadable(path, f"a LASzip record of points of {sum(size for _, size in items)} bytes, not {length}")
+    file.seek(start)
+    chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record[: 34 + 6 * count]))
+    at = start + 8
+    for number, (_, size) in enumerate(chunks):
+        file.seek(at + length + 4)
+        claimed = sum(struct.unpack(f"<{layers}I", file.read(4 * layers))) if size else 0
+        at += size
+        if at > end or claimed > size:
+            raise _unreadable(path, f"chunk {number} claims {max(size, claimed)} bytes")
 
 
 @contextmanager

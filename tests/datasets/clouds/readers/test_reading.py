@@ -249,6 +249,28 @@ def test_laz_that_the_decompressor_cannot_take(tmp_path):
             assert str(error).startswith(f"{path}: not a readable LAS file")  # noqa: PT017
 
 
+@pytest.mark.parametrize("streamed", [False, True])
+def test_laz_that_claims_more_memory_than_it_has_points(tmp_path, streamed):
+    """Sizes that the decompressor allocates: of a chunk in points and bytes, of a point's items, of a layer."""
+    path = write_las(tmp_path / "cloud.laz", diagonal(400), form=7, version="1.4")
+    good = bytearray(path.read_bytes())
+    record, (start,) = good.find(b"laszip encoded") + 52, struct.unpack_from("<I", good, 96)
+    if streamed:  # the place of the chunk table is at the end
+        good += good[start : start + 8]
+        good[start : start + 8] = b"\xff" * 8
+    path.write_bytes(good)
+    assert len(read_cloud(path)) == 400
+    claims = [(record + 12, "<I", 2**31), (record + 32, "<H", 1), (record + 32, "<H", 9000), (record + 36, "<H", 9999)]
+    claims += [(start + 8 + 36 + 4 + 4 * layer, "<I", 2**32 - 1) for layer in range(10)]
+    for at, form, value in claims:
+        damaged = bytearray(good)
+        struct.pack_into(form, damaged, at, value)
+        path.write_bytes(damaged)
+        for read in (read_cloud, open_stream):
+            with refused(path, "not a readable LAS file"):
+                read(path)
+
+
 @pytest.mark.parametrize(
     ("at", "form", "value", "said"),
     [
