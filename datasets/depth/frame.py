@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in
 from ..cameras import Camera
-from ..files import decoded, finite_number, read_json, readable, reader
-from ..views.images import read_cameras
+from ..files import decoded, read_json, readable, reader
+from ..views.formats.shots import Shot
+from ..views.images import read_shots
 from .camera import DepthCamera, read_intrinsics
 from .images import fit_color, read_color, read_depth
 
@@ -168,10 +169,7 @@ def _json_poses(path: Path) -> list[PosedFrame]:
     content = read_json(path)
     content = content if isinstance(content, dict) else {}
     if "frames" in content:
-        return [
-            (name, camera.world_from_camera.numpy(), DepthCamera.from_camera(camera))
-            for name, camera in read_cameras(path)
-        ]
+        return [_posed(shot) for shot in read_shots(path)]
     found: list[PosedFrame] = []
     if "t_00" in content:  # Polycam
         rows = [[content.get(f"t_{i}{j}") for j in range(4)] for i in range(3)]
@@ -179,8 +177,8 @@ def _json_poses(path: Path) -> list[PosedFrame]:
     elif isinstance(content.get("poses"), list):  # Record3D; its lens is that of the pictures
         for index, pose in enumerate(content["poses"]):
             named = f"{path}: poses[{index}]"
-            numbers = [finite_number(x, named) for x in pose] if isinstance(pose, list) else []
-            if len(numbers) != 7:
+            numbers = pose if isinstance(pose, list) and len(pose) == 7 else []
+            if not all(isinstance(x, int | float) for x in numbers) or not numbers:
                 raise InputError(f"{named}: expected qx, qy, qz, qw, tx, ty, tz")
             found.append((f"{index}", _rigid(_from_quaternion(numbers[4:], numbers[:4]), named, _OPENGL), None))
     else:  # Open3D: from world to camera, by columns
@@ -191,6 +189,12 @@ def _json_poses(path: Path) -> list[PosedFrame]:
             pose = _rigid(np.reshape(extrinsic, (4, 4)).T, f"{path}: parameters[{index}].extrinsic")
             found.append((None, np.asarray(np.linalg.inv(pose), np.float64), None))
     return found
+
+
+def _posed(shot: Shot) -> PosedFrame:
+    if shot.placed is None:
+        return shot.name, np.full((4, 4), np.nan), None
+    return shot.name, shot.placed.world_from_camera.numpy(), DepthCamera.from_camera(shot.placed)
 
 
 def _from_quaternion(place: list[float], quaternion: list[float]) -> Float64:

@@ -296,6 +296,10 @@ def test_poses_of_other_programs_are_camera_to_world(tmp_path, files, names):
 LOST = np.full((4, 4), -np.inf)  # as ScanNet writes it
 
 
+def frame(pose):
+    return {"file_path": "a.png", "transform_matrix": pose.tolist()}
+
+
 @pytest.mark.parametrize(
     "files",
     [
@@ -304,8 +308,10 @@ LOST = np.full((4, 4), -np.inf)  # as ScanNet writes it
         {"a.log": f"0 0 1\n{text(LOST)}\n1 1 1\n{text(POSE)}"},
         {"kitti.txt": text([np.full(12, np.nan), POSE[:3].ravel()])},
         {"tum.txt": text([[0, *[np.nan] * 7], [1, *POSE[:3, 3], *QUATERNION]])},
+        {"metadata": {"poses": [[np.nan] * 7, RECORD3D[0]]}},
+        {"transforms.json": {"w": 8, "h": 6, "fl_x": 9, "frames": [frame(LOST), frame(OPENGL)]}},
     ],
-    ids=["ScanNet", "with a last row", "Open3D log", "KITTI", "TUM"],
+    ids=["ScanNet", "with a last row", "Open3D log", "KITTI", "TUM", "Record3D", "transforms"],
 )
 def test_lost_frames_have_no_pose(tmp_path, files):
     paths = [write(tmp_path / name, content) for name, content in files.items()]
