@@ -183,7 +183,8 @@ def _check_chunks(path: Path, file: BinaryIO, place: tuple[int, int], record: by
     if sum(size for _, size in items) != length:
         raise _unreadable(path, f"a LASzip record of points of {sum(size for _, size in items)} bytes, not {length}")
     file.seek(start)
-    chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record[: 34 + 6 * count]))
+    layout = lazrs.LazVlr(record[: 34 + 6 * count])  # pyright: ignore[reportAttributeAccessIssue]
+    chunks = lazrs.read_chunk_table(file, layout)  # pyright: ignore[reportAttributeAccessIssue]
     at = start + 8
     for number, (_, size) in enumerate(chunks):
         file.seek(at + length + 4)
