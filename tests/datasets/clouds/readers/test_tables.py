@@ -210,23 +210,6 @@ def test_pcd(tmp_path, kind, packed):
         read_cloud(path)
 
 
-def test_e57(tmp_path):
-    pye57 = pytest.importorskip("pye57")
-    path = tmp_path / "a.e57"
-    file, middle = pye57.E57(str(path), mode="w"), P.mean(axis=0)  # what it writes are float32, moved by float64
-    for rows in (slice(0, 15), slice(15, COUNT)):
-        fields = {f"cartesian{a}": column for a, column in zip("XYZ", (P - middle)[rows].T, strict=True)}
-        shades = C[rows].astype(np.uint8).T
-        fields |= {f"color{a}": np.ascontiguousarray(s) for a, s in zip(("Red", "Green", "Blue"), shades, strict=True)}
-        fields |= {"intensity": np.ones(len(P[rows]))} if rows.start else {}
-        file.write_scan_raw(fields, rotation=np.array([1.0, 0, 0, 0]), translation=middle)
-    file.close()
-    assert "of some scans only, and ignored: intensity" in check(path, "c").reading
-    path.write_bytes(path.read_bytes()[:900])
-    with refused(path, "E57"):
-        read_cloud(path)
-
-
 def test_npy(tmp_path):
     for columns, expected in (((P,), ""), ((P, N), "n"), ((P, N, C), "nc"), ((P, C, N), "nc"), ((P, RGB16), "c")):
         np.save(tmp_path / "a.npy", np.concatenate(columns, axis=1))
