@@ -166,7 +166,7 @@ _DISTORTIONS = ("distortion_coefficients", "dist_coeffs", "D", "d")
 
 def _from_text(text: str, path: Path) -> Any:
     """YAML with names, or bare numbers."""
-    words = re.sub(r"#.*", "", text).replace(",", " ").split()
+    words = re.sub(r"#.*|[][,]", " ", text).split()
     try:
         numbers = [float(word) for word in words]
     except ValueError:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
@@ -142,7 +142,9 @@ def _file_poses(path: Path) -> list[PosedFrame]:
     if path.suffix.lower() == ".json" or path.name == "metadata":
         return _json_poses(path)
     with readable(path):
-        text = re.sub(r"#.*", "", decoded(path.read_bytes())).replace(",", " ")
+        text = decoded(path.read_bytes())
+    w_first = re.search(r"\bq\w*w\b.*\bq\w*x\b", text, re.IGNORECASE) is not None  # in a comment on the columns
+    text = re.sub(r"#.*", "", text).replace(",", " ")
     lines = [line.split() for line in text.splitlines() if line.strip()]
     try:
         rows = [[float(word) for word in words] for words in lines]
@@ -155,7 +157,7 @@ def _file_poses(path: Path) -> list[PosedFrame]:
     elif widths == [4] * 4 or widths == [4] * 3:
         matrices = [rows]
     elif rows and set(widths) == {8}:
-        matrices = [_from_quaternion(row[1:4], row[4:]) for row in rows]
+        matrices = [_from_quaternion(row[1:4], np.roll(row[4:], -1 if w_first else 0)) for row in rows]
         names = [words[0] for words in lines]
     elif rows and set(widths) in ({12}, {16}):
         matrices = [np.reshape(row, (-1, 4)) for row in rows]
@@ -197,10 +199,10 @@ def _posed(shot: Shot) -> PosedFrame:
     return shot.name, shot.placed.world_from_camera.numpy(), DepthCamera.from_camera(shot.placed)
 
 
-def _from_quaternion(place: list[float], quaternion: list[float]) -> Float64:
+def _from_quaternion(place: Sequence[float], quaternion: ArrayLike) -> Float64:
     pose = np.eye(4)
     pose[:3, 3] = place
-    if np.isfinite(quaternion).all() and any(quaternion):
+    if np.isfinite(quaternion).all() and np.any(quaternion):
         pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()  # x, y, z, w, of any length
     else:
         pose[:3, :3] = np.nan

@@ -13,8 +13,9 @@ from torch.nn.functional import normalize
 BACKENDS = ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)]
 QUICK = ("multiscale-tapered", "encoded")  # compiling takes seconds
 NAMES = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in FIELDS]
+WARNINGS = ("UserWarning", "DeprecationWarning", "FutureWarning")
 # The compiler warns of what it does itself.
-pytestmark = [pytest.mark.filterwarnings(f"ignore::{kind}") for kind in ("UserWarning", "DeprecationWarning")]
+pytestmark = [pytest.mark.filterwarnings(f"ignore::{kind}") for kind in WARNINGS]
 
 
 @pytest.fixture(autouse=True)

@@ -64,12 +64,15 @@ class Table:
 
 # Names without case, units, marks, and the words `_FILLERS`; what comes first counts.
 _NAMES = {
-    "points": ("x y z", "px py pz", "easting northing elevation", "easting northing height", "e n h"),
-    "normals": ("nx ny nz", "xn yn zn", "normal0 normal1 normal2"),
-    "colors": ("red green blue", "r g b", "red8 green8 blue8", "r8 g8 b8", "red16 green16 blue16", "r16 g16 b16"),
+    "points": ("x y z", "px py pz", "easting northing elevation", "easting northing height", "e n h", "0 1 2"),
+    "normals": ("nx ny nz", "xn yn zn", "normal0 normal1 normal2", "normals0 normals1 normals2"),
+    "colors": (
+        *("red green blue", "r g b", "red8 green8 blue8", "r8 g8 b8", "red16 green16 blue16", "r16 g16 b16"),
+        *("rf gf bf", "rgb0 rgb1 rgb2", "colors0 colors1 colors2"),
+    ),
 }
 _FILLERS = re.compile(
-    r"scalar|cartesian|diffuse|vertex|point|position|pos|coordinates?|coord|color|colour|channel|value"
+    r"scalar|cartesian|diffuse|vertex|points?|position|pos|coordinates?|coord|color|colour|channel|value"
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from .columns import CloudStream, Layout, RawRows, Table, describe_layout, named
 # Of the public header (LAS 1.4 R15, 2.4): version, sizes, how many records and points; the last part is of 1.4 alone.
 _VERSION = struct.Struct("<BB"), 24
 _SIZES = struct.Struct("<HIIBHI"), 94
+_SCALES = struct.Struct("<3d"), 131
 _SIZES_14 = struct.Struct("<QIQ"), 235
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of LASzip's items by their kind; extra bytes (14) have one for each byte
 
@@ -111,7 +113,7 @@ def _check_sizes(path: Path) -> None:
     if head[:4] != b"LASF" or len(head) < 227:
         raise InputError(f"{path}: not a readable LAS file (no header); export it again")
     header, start, records, form, length, points = _at(head, _SIZES)
-    late_start, late = size, 0
+    (late_start, late), scales = (size, 0), _at(head, _SCALES)
     if _at(head, _VERSION) >= (1, 4) and len(head) == 375:
         late_start, late, points = _at(head, _SIZES_14)
     compressed = bool(form & 0x80)
@@ -123,6 +125,8 @@ def _check_sizes(path: Path) -> None:
         if records * 54 > start - header  # bytes of a record without its content; of a late one, 60
         else f"byte 105: points of {length} bytes"
         if length < 20
+        else f"byte 131: scales {scales}"
+        if not all(0 < abs(scale) < math.inf for scale in scales)
         else f"byte 243: {late} records after the points, from byte {late_start} of {size}"
         if late and late_start + late * 60 > size
         else f"{points} points in {room} bytes"
@@ -205,7 +209,7 @@ def _reading(path: Path) -> Iterator[None]:
         raise _unreadable(path, (str(error).splitlines() or [type(error).__name__])[0]) from error
 
 
-def _at(head: bytes, field: tuple[struct.Struct, int]) -> tuple[int, ...]:
+def _at(head: bytes, field: tuple[struct.Struct, int]) -> tuple[Any, ...]:
     form, offset = field
     return form.unpack_from(head, offset)
 
