@@ -16,7 +16,6 @@ from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in
 from ..cameras import Camera
 from ..files import decoded, read_json, readable, reader
-from ..views.formats.shots import Shot
 from ..views.images import read_shots
 from .camera import DepthCamera, read_intrinsics
 from .images import fit_color, read_color, read_depth
@@ -171,7 +170,13 @@ def _json_poses(path: Path) -> list[PosedFrame]:
     content = read_json(path)
     content = content if isinstance(content, dict) else {}
     if "frames" in content:
-        return [_posed(shot) for shot in read_shots(path)]
+        placed = ((shot.name, shot.placed) for shot in read_shots(path))
+        return [
+            (name, np.full((4, 4), np.nan), None)
+            if camera is None
+            else (name, camera.world_from_camera.numpy(), DepthCamera.from_camera(camera))
+            for name, camera in placed
+        ]
     found: list[PosedFrame] = []
     if "t_00" in content:  # Polycam
         rows = [[content.get(f"t_{i}{j}") for j in range(4)] for i in range(3)]
@@ -191,12 +196,6 @@ def _json_poses(path: Path) -> list[PosedFrame]:
             pose = _rigid(np.reshape(extrinsic, (4, 4)).T, f"{path}: parameters[{index}].extrinsic")
             found.append((None, np.asarray(np.linalg.inv(pose), np.float64), None))
     return found
-
-
-def _posed(shot: Shot) -> PosedFrame:
-    if shot.placed is None:
-        return shot.name, np.full((4, 4), np.nan), None
-    return shot.name, shot.placed.world_from_camera.numpy(), DepthCamera.from_camera(shot.placed)
 
 
 def _from_quaternion(place: Sequence[float], quaternion: ArrayLike) -> Float64:

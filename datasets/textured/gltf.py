@@ -27,6 +27,7 @@ from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+Pose = tuple[list[float], Float64]  # of a mesh: weights of its morph targets, and matrices (J, 4, 4) of joints or node
 
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -44,13 +45,6 @@ class _Piece(NamedTuple):
     uv: Float64
     colors: Float64 | None
     paint: int
-
-
-class _Pose(NamedTuple):
-    """How a node poses its mesh: weights of the morph targets, and matrices ``(J, 4, 4)`` of joints or its own."""
-
-    weights: list[float]
-    joints: Float64
 
 
 def read_gltf(path: Path, *, textures: bool = True) -> TexturedMesh:
@@ -194,40 +188,33 @@ def _pieces(document: _Document, materials: dict[str, Paint], *, textures: bool)
         open_nodes += [(child, places[number]) for child in nodes[number].get("children", [])]
     for node, placed in ((nodes[number], placed) for number, placed in places.items()):
         mesh = header["meshes"][node["mesh"]] if "mesh" in node else {"primitives": []}
-        posed = _Pose(node.get("weights", mesh.get("weights", [])), placed[None])
-        if "skin" in node:
-            posed = posed._replace(joints=_joints(document, header["skins"][node["skin"]], places))
+        weights, joints = node.get("weights", mesh.get("weights", [])), placed[None]
+        if "skin" in node:  # whose joints place the mesh, and its node does not
+            skin = header["skins"][node["skin"]]
+            joints = np.stack([places[number] for number in skin["joints"]])
+            if "inverseBindMatrices" in skin:
+                bound = document.accessor(skin["inverseBindMatrices"])[: len(joints)]
+                joints = joints @ bound.reshape(-1, 4, 4).swapaxes(1, 2)
         for primitive in mesh["primitives"]:
-            if (
-                primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
-                and "POSITION" in primitive["attributes"]
-            ):
-                yield _piece(document, primitive, posed, materials, textures=textures)
+            if _TRIANGLES <= primitive.get("mode", _TRIANGLES) <= _FAN and "POSITION" in primitive["attributes"]:
+                yield _piece(document, primitive, (weights, joints), materials, textures=textures)
 
 
-def _joints(document: _Document, skin: dict[str, Any], places: dict[int, Float64]) -> Float64:
-    """The matrices ``(J, 4, 4)`` of a skin's joints, from the mesh to the scene."""
-    joints = np.stack([places[number] for number in skin["joints"]])
-    if "inverseBindMatrices" not in skin:
-        return joints
-    return joints @ document.accessor(skin["inverseBindMatrices"])[: len(joints)].reshape(-1, 4, 4).swapaxes(1, 2)
-
-
-def _posed(document: _Document, primitive: dict[str, Any], posed: _Pose) -> tuple[Float64, bool]:
+def _posed(document: _Document, primitive: dict[str, Any], pose: Pose) -> tuple[Float64, bool]:
     """The vertices of a primitive in the scene, in the pose at rest, and whether it is mirrored there."""
-    attributes = primitive["attributes"]
+    attributes, (shares, joints) = primitive["attributes"], pose
     vertices = document.accessor(attributes["POSITION"]).astype(np.float64)
-    for weight, target in zip(posed.weights, primitive.get("targets", []), strict=False):
+    for weight, target in zip(shares, primitive.get("targets", []), strict=False):
         if "POSITION" in target:
             vertices += _finite(weight, "weights") * document.accessor(target["POSITION"])
-    if "JOINTS_0" not in attributes or len(posed.joints) == 1:
-        placed = posed.joints[0]
+    if "JOINTS_0" not in attributes or len(joints) == 1:
+        placed = joints[0]
         return vertices @ placed[:3, :3].T + placed[:3, 3], bool(np.linalg.det(placed[:3, :3]) < 0)
     sets = range(sum(name.startswith("JOINTS_") for name in attributes))
     weights = np.hstack([document.accessor(attributes[f"WEIGHTS_{k}"]) for k in sets]).astype(np.float64)
-    joints = np.hstack([document.accessor(attributes[f"JOINTS_{k}"]) for k in sets])
+    used = np.hstack([document.accessor(attributes[f"JOINTS_{k}"]) for k in sets])
     weights /= np.where(weights.any(axis=1), weights.sum(axis=1), 1)[:, None]
-    placed = np.einsum("nk,nkij->nij", weights, posed.joints[joints])
+    placed = np.einsum("nk,nkij->nij", weights, joints[used])
     return np.einsum("nij,nj->ni", placed[:, :3, :3], vertices) + placed[:, :3, 3], False
 
 
@@ -245,10 +232,10 @@ def _transform(node: dict[str, Any], *, ours: bool) -> Float64:
 
 
 def _piece(
-    document: _Document, primitive: dict[str, Any], posed: _Pose, materials: dict[str, Paint], *, textures: bool
+    document: _Document, primitive: dict[str, Any], pose: Pose, materials: dict[str, Paint], *, textures: bool
 ) -> _Piece:
     attributes = primitive["attributes"]
-    vertices, mirrored = _posed(document, primitive, posed)
+    vertices, mirrored = _posed(document, primitive, pose)
     count = len(vertices)
     order = np.arange(count)
     if "indices" in primitive:

@@ -171,26 +171,24 @@ def _check_laz(path: Path, start: int, points: int, length: int) -> None:
 
 
 def _check_chunks(path: Path, file: BinaryIO, place: tuple[int, int], record: bytes, length: int) -> None:
-    """Refuse points, chunks or layers that are longer than what holds them: the decompressor allocates what they claim.
+    """Refuse points, chunks and layers that claim more than what holds them has: the decompressor would allocate it.
 
-    The LASzip record lists kinds and sizes of the items of a point. A layered chunk (compressor 3) begins with a point
-    as it is, the number of points, and the sizes of its layers.
+    The record lists the items of a point; a layered chunk begins with a point, their count, and the layers' sizes.
     """
     try:
         import lazrs
     except ImportError:  # laspy then uses LASzip itself
         return
-    (start, end), compressor = place, record[0]
+    (at, end), compressor = place, record[0]
     (count,) = struct.unpack_from("<H", record, 32)
-    items = [struct.unpack_from("<HH", record, 34 + 6 * k) for k in range(count)]
-    layers = sum(_LAYERS.get(kind, size) for kind, size in items) if compressor == 3 else 0
-    if sum(size for _, size in items) != length:
-        raise _unreadable(path, f"a LASzip record of points of {sum(size for _, size in items)} bytes, not {length}")
-    file.seek(start)
+    items = list(struct.iter_unpack("<HHH", record[34 : 34 + 6 * count]))  # kind, size, version
+    layers = sum(_LAYERS.get(kind, size) for kind, size, _ in items) if compressor == 3 else 0
+    if (whole := sum(size for _, size, _ in items)) != length:
+        raise _unreadable(path, f"a LASzip record of points of {whole} bytes, not {length}")
+    file.seek(at)
     layout = lazrs.LazVlr(record[: 34 + 6 * count])  # pyright: ignore[reportAttributeAccessIssue]
-    chunks = lazrs.read_chunk_table(file, layout)  # pyright: ignore[reportAttributeAccessIssue]
-    at = start + 8
-    for number, (_, size) in enumerate(chunks):
+    at += 8
+    for number, (_, size) in enumerate(lazrs.read_chunk_table(file, layout)):  # pyright: ignore
         file.seek(at + length + 4)
         claimed = sum(struct.unpack(f"<{layers}I", file.read(4 * layers))) if size else 0
         at += size
