@@ -20,12 +20,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from evolutions import few_points
 from mplicits import datasets
 from mplicits.datasets import PointCloud, sample_torus, simulate_scan, write_cloud_ply
 from mplicits.datasets.synthetic.scenes import scene_mesh
 from mplicits.neural_fields import Similarity, Sphere, Torus, extract_mesh
 from mplicits.pipelines.cli import main
+from mplicits.pipelines.fit.official import export_official
 from mplicits.pipelines.mesh import finish
 from mplicits.pipelines.mesh.extract import MeshOptions
 from mplicits.pipelines.mesh.files import write_mesh
@@ -164,10 +166,21 @@ def depth_maps(path: Path) -> None:
     (path.parent / "camera.json").write_text(json.dumps(lens))
 
 
+def an_official_model(path: Path) -> None:
+    a_run(path.parent / "made")
+    export_official(path.parent / "made", path)
+
+
+def a_siren(path: Path) -> None:
+    torch.save(torch.nn.Sequential(torch.nn.Linear(3, 8), torch.nn.Linear(8, 1)).state_dict(), path)
+
+
 STAND_INS: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("*scan.ply", "scans/*.ply", "ten_million.ply"), a_cloud),
     "*.ply": a_mesh,
     "*.npz": arrays,
+    "results/*": an_official_model,
+    "*.pth": a_siren,
     "meshes": lambda path: a_mesh(path / "torus.ply"),
     **dict.fromkeys(("runs/morph", "runs/turn"), a_motion),
     **dict.fromkeys(("runs/*", "demo/run"), a_run),

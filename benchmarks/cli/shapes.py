@@ -126,6 +126,29 @@ def _srb(arguments: argparse.Namespace) -> int:
     return run_benches(arguments, [bench], out=arguments.out)
 
 
+def _official_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="DIR", help="where their archive was unpacked: with data/ in it")
+    about = "their checkpoints, a folder with results/NAME/coarse/best.pth and so on, measured here as well"
+    parser.add_argument("--official", type=Path, metavar="RESULTS", help=about)
+    parser.add_argument("--shapes", nargs="+", default=(), metavar="NAME", help="only these (all)")
+    about = "first write these meshes into DIR as their archive has them: in the unit sphere, and with noise"
+    parser.add_argument("--add", nargs="+", type=Path, default=(), metavar="MESH", help=about)
+    measured_flags(parser, 512, 500_000)
+    folder_flag(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
+
+
+def _official(arguments: argparse.Namespace) -> int:
+    config = read_settings(arguments, FitConfig)
+    from ..shapes.official import OfficialBench, add_shapes
+
+    add_shapes(arguments.folder, arguments.add, seed=config.seed)
+    options = {name: getattr(arguments, name) for name in ("folder", "shapes", "resolution")}
+    bench = OfficialBench(config=config, results=arguments.official, samples=arguments.eval_samples, **options)
+    return run_benches(arguments, [bench], out=arguments.out)
+
+
 # The paper's (64,1), with a frequency and a schedule at which it is a closed surface that looks like the shape.
 COARSE = FitConfig(widths=(64,), depths=(1,), omegas=(40.0,), steps=(1500,), learning_rates=(2e-2,), samples=200_000)
 
@@ -220,6 +243,15 @@ SHAPES: Mapping[str, Command] = MappingProxyType(
             _srb,
             "Fit the scans of a folder with their normals and without, and measure every level against the true "
             "surfaces, in raw units and in the unit sphere, by the protocols of the papers.",
+        ),
+        "official": Command(
+            "the protocol of the paper's own code on its folders, beside its checkpoints",
+            """  python -m benchmarks official m-plicits/ -o official --official m-plicits/results
+  python -m benchmarks official shapes/ --add armadillo.ply bunny.ply -o official --preset fast""",
+            _official_arguments,
+            _official,
+            "Fit the clean and the noisy inputs of dsilvavinicius/m-plicits, and measure every level, and its own "
+            "checkpoints, as it does. Finished shapes are kept.",
         ),
         "texture": Command(
             "how near textures on coarse surfaces come to UV textures",

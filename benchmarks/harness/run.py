@@ -12,11 +12,12 @@ from typing import Any, Generic, TypeVar
 
 import torch
 from mplicits.neural_fields.backend.devices import choose_device
-from mplicits.pipelines.training.jobs import Outcome, check_jobs, run_jobs, run_streams
+from mplicits.pipelines.training.jobs import Outcome, check_jobs, run_jobs
 from mplicits.pipelines.training.scaffold import environment
 from mplicits.pipelines.training.trainer import Interrupted, Report
 
 from .jobs import Context, Job, Record, Registry, read_record, write_record
+from .streams import run_streams
 
 Say = Callable[[str], None]
 C = TypeVar("C", bound=Job)

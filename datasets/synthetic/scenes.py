@@ -93,7 +93,7 @@ def render_scene(
     images: list[PosedImage] = []
     for first in range(0, views, together):
         some = cameras[first : first + together]
-        maps = _depths(scene, some) if depths else [None] * len(some)
+        maps = scene_depths(scene, some) if depths else [None] * len(some)
         for camera, seen, depth in zip(some, _pictures(scene, some, samples, shaded, glossy), maps, strict=True):
             images.append(PosedImage(f"{len(images):03d}.png", camera, *seen, depth))
         if progress is not None:
@@ -103,13 +103,8 @@ def render_scene(
     return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name), seen)
 
 
-def scene_depths(scene: Scene, camera: Camera) -> DepthMap:
-    """Depths ``(H, W)`` along the axis of view at the centres of a camera's pixels; NaN for a miss."""
-    return _depths(scene, [camera])[0]
-
-
-def _depths(scene: Scene, cameras: Sequence[Camera]) -> list[DepthMap]:
-    """`scene_depths` of several cameras, whose rays are traced together."""
+def scene_depths(scene: Scene, cameras: Sequence[Camera]) -> list[DepthMap]:
+    """Depths ``(H, W)`` along the axes of view at the centres of cameras' pixels, traced together; NaN for a miss."""
     maps = []
     for camera, hits in zip(cameras, _traced(scene, cameras), strict=True):
         ahead = (hits.position - camera.eye) @ camera.forward

@@ -16,6 +16,7 @@ from .common import Command, Program, add_flags, add_settings, between, check_ou
 from .draw import ANIMATE, RENDER, SLICE, VIEW
 from .fit import FIT, describe
 from .mesh import BOOLEAN, EVALUATE, MESH, OFFSET
+from .official import EXPORT, IMPORT
 from .train import EVOLVE, RECONSTRUCT, TEXTURE
 from .views import CHECK_CAMERAS, FIND_CAMERAS, FIND_POINTS, SCENE
 from .web import WEB
@@ -144,6 +145,8 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "mesh": MESH,
         "boolean": BOOLEAN,
         "offset": OFFSET,
+        "import": IMPORT,
+        "export": EXPORT,
         "texture": TEXTURE,
         "reconstruct": RECONSTRUCT,
         "evolve": EVOLVE,

@@ -294,6 +294,8 @@ def _describe_record(record: dict[str, Any], path: Path) -> Rows:
     if not record:
         return []
     rows: Rows = [("fitted to", str(record.get("cloud", "?")))]
+    if record.get("imported"):
+        rows.append(("imported", ", ".join(record["imported"])))
     cleaning, environment = record.get("cleaning", {}), record.get("environment", {})
     if record.get("reading"):
         rows.append(("read", record["reading"]))

@@ -107,18 +107,24 @@ __all__ = [  # noqa: RUF022
 ]
 
 
-def load(path: str | Path, *, time: float | None = None, device: Device | str = "cpu") -> WorldField:
+def load(path: str | Path, *, time: float | None = None, device: Device | str = "cpu", **official: Any) -> WorldField:
     """The field of a run or file, in the coordinates of its input.
 
     Args:
-        path: run directory of ``mplicits fit``, ``reconstruct`` or ``evolve``, or a .safetensors file.
+        path: run directory of ``mplicits fit``, ``reconstruct`` or ``evolve``, or a .safetensors file; or a model of
+            the paper's own code, a folder with ``coarse/best.pth`` or a .pth file.
         time: the moment, from 0 to 1, of a surface that moves; None for one that does not.
         device: where to put the field.
+        official: options of `read_official`, for a model of the paper's code: ``cloud``, ``deltas``, ``w0``,
+            ``negate``.
 
     Raises:
         InputError: there is no such run, it is damaged, or the time does not fit to it.
     """
     folder = importlib.import_module("mplicits.pipelines.training.folder")
+    if official or folder.is_official(path):
+        read = importlib.import_module("mplicits.pipelines.fit.official").read_official(path, **official)
+        return importlib.import_module("mplicits.neural_fields").WorldField(read.field.to(device), read.similarity)
     saved = folder.load_still(path, time, device=device)
     return importlib.import_module("mplicits.neural_fields").WorldField(saved.field, saved.similarity)
 

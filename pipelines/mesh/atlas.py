@@ -118,15 +118,10 @@ def to_frame(directions: Float64, normals: Float64, tangents: Float64) -> Float6
 
     ``normals`` ``(N, 3)`` and ``tangents`` ``(N, 4)`` are interpolated between vertices, of any length.
     """
-    return np.asarray(np.linalg.solve(_axes(normals, tangents), directions[..., None])[..., 0], np.float64)
+    return np.asarray(np.linalg.solve(frame_axes(normals, tangents), directions[..., None])[..., 0], np.float64)
 
 
-def from_frame(coordinates: Float64, normals: Float64, tangents: Float64) -> Float64:
-    """The inverse of `to_frame`, which is what a renderer does with a normal map."""
-    return (_axes(normals, tangents) @ coordinates[..., None])[..., 0]
-
-
-def _axes(normals: Float64, tangents: Float64) -> Float64:
+def frame_axes(normals: Float64, tangents: Float64) -> Float64:
     """Columns ``(N, 3, 3)`` tangent, bitangent, normal, each of unit length, as three.js and Blender use them."""
     normals, along = unit_rows(normals), unit_rows(tangents[:, :3])
     across = unit_rows(np.cross(normals, along)) * np.sign(tangents[:, 3:])

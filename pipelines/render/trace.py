@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -62,12 +62,6 @@ class Seen:
     normal: Tensor
     direction: Tensor
     color: Tensor | None = None
-
-    def part(self, rows: slice) -> Seen:
-        """Some of the rows."""
-        names = ("pixel", "depth", "position", "normal", "direction")
-        kept = {name: getattr(self, name)[rows] for name in names}
-        return replace(self, **kept, color=None if self.color is None else self.color[rows])
 
 
 def strips(camera: Camera, pixels: Callable[[], int]) -> Iterator[tuple[int, Camera]]:

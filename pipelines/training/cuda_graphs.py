@@ -50,19 +50,6 @@ class CudaGraphRecorder(Recorder):
         return graph.replay, results
 
 
-class EagerRecorder(Recorder):
-    """Runs the work itself again, for devices without graphs, so that replays can be compared with eager steps."""
-
-    def record(self, work: Work) -> tuple[Callable[[], None], Results]:
-        """See `Recorder.record`."""
-        results: dict[str, Tensor] = {}
-
-        def replay() -> None:
-            results.update(work())
-
-        return replay, results
-
-
 @dataclass
 class _Graph:
     """The graph of a kind of step."""

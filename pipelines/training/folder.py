@@ -191,6 +191,8 @@ def find_field(path: str | Path) -> Path:
             field is not the one of the run's record.
     """
     path = Path(path)
+    if is_official(path):
+        raise InputError(f"{path}: a model of other code; make a run of it with `mplicits import {path} -o RUN`")
     if path.is_dir():
         field = path / FIELD_FILE
         _check_whole(path)
@@ -211,7 +213,13 @@ def find_field(path: str | Path) -> Path:
 
 def is_field(path: str | Path) -> bool:
     """Whether ``path`` is meant as a run or a checkpoint rather than as a mesh or a cloud."""
-    return Path(path).is_dir() or Path(path).suffix.lower() == ".safetensors"
+    return Path(path).is_dir() or Path(path).suffix.lower() == ".safetensors" or is_official(path)
+
+
+def is_official(path: str | Path) -> bool:
+    """Whether ``path`` is a model as the paper's own code writes it, a .pth file or a folder of them, and no run."""
+    path = Path(path)
+    return path.suffix.lower() in (".pth", ".pt") or (path / "coarse" / "best.pth").is_file()
 
 
 def load_still(path: str | Path, time: float | None = None, *, device: torch.device | str = "cpu") -> SavedField:

@@ -1,4 +1,4 @@
-"""Many independent pieces of work: one after the other, in streams of one GPU, or in local workers of Ray."""
+"""Many independent pieces of work: one after the other, or in local workers of Ray."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import torch
 
 from ...neural_fields import InputError
-from .trainer import Interrupted, shared_flag, stop_on_signals
+from .trainer import Interrupted
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -70,53 +69,14 @@ def run_jobs(
     if jobs == 1 or len(items) < 2:
         outcomes = []
         for item in items:
-            outcomes.append(_outcome(function, item))
+            outcomes.append(outcome_of(function, item))
             report(outcomes[-1])
         return outcomes
     return _side_by_side(function, items, min(jobs, len(items)), report)
 
 
-def run_streams(
-    function: Callable[[Item], Result],
-    items: Sequence[Item],
-    *,
-    streams: int,
-    device: torch.device,
-    report: Callable[[Outcome[Item, Result]], None] | None = None,
-) -> list[Outcome[Item, Result]]:
-    """`run_jobs` in ``streams`` threads of this process, each with a CUDA stream of its own (on a CPU: threads alone).
-
-    A training of small networks keeps a small part of a GPU busy; several streams are worked on at the same time, with
-    the same results.
-
-    Raises:
-        Interrupted: Ctrl-C. Trainings under way see it by `stop_on_signals`, nothing else is begun.
-    """
-    outcomes: dict[int, Outcome[Item, Result]] = {}
-
-    def enter() -> None:
-        if device.type == "cuda":
-            torch.cuda.set_stream(torch.cuda.Stream(device))
-
-    with stop_on_signals() as flag, ThreadPoolExecutor(streams, initializer=enter) as threads:
-
-        def work(item: Item) -> Outcome[Item, Result]:
-            if flag.requested:
-                raise Interrupted(None)
-            with shared_flag(flag):
-                return _outcome(function, item)
-
-        waiting = {threads.submit(work, item): index for index, item in enumerate(items)}
-        while waiting:
-            # A signal that arrives just before a wait is heard after it, so that no wait may be long.
-            for done in wait(waiting, 0.2, FIRST_COMPLETED).done:
-                outcome = outcomes[waiting.pop(done)] = done.result()
-                if report is not None:
-                    report(outcome)
-    return [outcomes[index] for index in range(len(items))]
-
-
-def _outcome(function: Callable[[Item], Result], item: Item) -> Outcome[Item, Result]:
+def outcome_of(function: Callable[[Item], Result], item: Item) -> Outcome[Item, Result]:
+    """What becomes of one item; only `Interrupted` is raised."""
     started = time.monotonic()
     try:
         value = function(item)
@@ -146,7 +106,7 @@ def _side_by_side(
 
     def work(item: Item) -> Outcome[Item, Result]:
         torch.set_num_threads(threads)
-        return _outcome(function, item)
+        return outcome_of(function, item)
 
     ray.init(
         address="local",

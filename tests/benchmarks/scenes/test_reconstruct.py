@@ -13,10 +13,10 @@ from mplicits.neural_fields.networks.colors import BackgroundField, ColorNetwork
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.objective import GraphTrainer, SceneObjective, scene_trainer
-from mplicits.pipelines.training.cuda_graphs import EagerRecorder
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import StopFlag
 from reconstructions import small_reconstructions
+from recorders import EagerRecorder
 from refusals import refused
 
 from benchmarks.cli import main

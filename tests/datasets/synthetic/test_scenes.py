@@ -65,7 +65,7 @@ def test_views_that_are_traced_together_show_what_each_does_alone(at_once, monke
         color, mask = render_view(scene, view.camera, samples=2, shaded=True)
         np.testing.assert_allclose(view.color, color, atol=1e-6)
         np.testing.assert_allclose(view.mask, mask, atol=1e-6)
-        alone = scenes.scene_depths(scene, view.camera)
+        alone = scenes.scene_depths(scene, [view.camera])[0]
         np.testing.assert_allclose(view.depth.numbers, alone.numbers, atol=1e-6)
 
 

@@ -16,7 +16,6 @@ from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import GraphTrainer, SceneObjective
 from mplicits.pipelines.training.cuda_graphs import (
     CudaGraphRecorder,
-    EagerRecorder,
     GraphCache,
     Recorder,
     Results,
@@ -24,6 +23,7 @@ from mplicits.pipelines.training.cuda_graphs import (
 )
 from mplicits.pipelines.training.trainer import Trainer
 from reconstructions import QUICK, TINY_SCENE, painted_sphere, weights, without
+from recorders import EagerRecorder
 from torch import Tensor
 
 TINY = replace(TINY_SCENE, steps=34, jets=400, **QUICK)

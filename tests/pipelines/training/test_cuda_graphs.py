@@ -5,7 +5,8 @@ from typing import NoReturn
 
 import torch
 from mplicits.neural_fields.backend.devices import GraphInputs, graph_input, has_graph_inputs
-from mplicits.pipelines.training.cuda_graphs import CudaGraphRecorder, EagerRecorder, GraphCache, Recorder
+from mplicits.pipelines.training.cuda_graphs import CudaGraphRecorder, GraphCache, Recorder
+from recorders import EagerRecorder
 from torch import Tensor
 
 

@@ -8,8 +8,10 @@ import threading
 import pytest
 import torch
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.training.jobs import Outcome, run_jobs, run_streams
+from mplicits.pipelines.training.jobs import Outcome, run_jobs
 from mplicits.pipelines.training.trainer import Interrupted, seeded, stop_on_signals
+
+from benchmarks.harness.streams import run_streams
 
 
 def reciprocal(number: int) -> float:
