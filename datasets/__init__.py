@@ -11,14 +11,7 @@ from .depth.cloud import DepthReport, DepthSettings, frame_cloud, fuse_frames
 from .depth.frame import RgbdFrame, read_frame, read_poses, read_trajectory
 from .depth.images import read_color, read_depth
 from .files import is_depth_file
-from .synthetic.samples import (
-    add_isotropic_noise,
-    add_noise,
-    add_outliers,
-    sample_sphere,
-    sample_surface,
-    sample_torus,
-)
+from .synthetic.samples import add_isotropic_noise, add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
 from .synthetic.scanner import STATUE_PLACEMENT, ScanFaults, SimulatedScan, scan_with_truth, simulate_scan, statue_scan
 from .synthetic.scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
 from .synthetic.statue import Statue

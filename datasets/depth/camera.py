@@ -53,11 +53,7 @@ class DepthCamera:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"{name}={value}: expected a finite number > 0")
-        for name, value in (
-            ("cx", self.cx),
-            ("cy", self.cy),
-            *zip(COEFFICIENTS[:5], self.distortion, strict=True),
-        ):
+        for name, value in (("cx", self.cx), ("cy", self.cy), *zip(COEFFICIENTS[:5], self.distortion, strict=True)):
             if not math.isfinite(value):
                 raise ValueError(f"{name}={value}: expected a finite number")
 

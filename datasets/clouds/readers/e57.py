@@ -39,7 +39,8 @@ def read_e57(path: Path, columns: str | None = None) -> PointCloud:
         scans = [_scan(file.image_file, header) for header in headers]
         stored = sum(int(header.point_count) for header in headers)
     except Exception as error:  # libE57's own, and what pye57 trips over
-        raise InputError(f"{path}: not a readable E57 file ({str(error).splitlines()[0]}); export it again") from error
+        reason = [*str(error).splitlines(), type(error).__name__][0]
+        raise InputError(f"{path}: not a readable E57 file ({reason}); export it again") from error
     shared = [name for name in (scans[0] if scans else ()) if all(name in scan for scan in scans)]
     if not shared:
         raise InputError(f"{path}: no scan with points in it; export it again")
@@ -53,7 +54,7 @@ def read_e57(path: Path, columns: str | None = None) -> PointCloud:
 
 def _scan(image: Any, header: Any) -> dict[str, Float64]:
     """The valid points of a scan in the file's coordinates, with colours as fractions; other fields are left empty."""
-    from pye57 import libe57
+    from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
 
     count = int(header.point_count)
     read = {name: np.empty(count) for name in header.point_fields if _READ.fullmatch(name)}
@@ -61,7 +62,6 @@ def _scan(image: Any, header: Any) -> dict[str, Float64]:
     for name, values in read.items():
         buffers.append(libe57.SourceDestBuffer(image, name, values, count, True, True))
     header.points.reader(buffers).read()
-
     pose = {}
     for part, axes in (("rotation", "xyzw"), ("translation", "xyz")):
         there = header.node.isDefined(f"pose/{part}")

@@ -162,10 +162,9 @@ def _check_laz(path: Path, start: int, points: int, length: int) -> None:
         entry = file.read(8)
         chunks = int.from_bytes(entry[4:], "little") if len(entry) == 8 else -1
         fixed = chunk not in (0, 2**32 - 1)
-        if not 0 <= chunks <= size or (fixed and chunks > points // chunk + 1) or not chunk:
-            raise _unreadable(path, f"a chunk table of {chunks} chunks at byte {table}")
-        if fixed and chunk * length > max(MODEST, points * length):  # memory for whole chunks is allocated
-            raise _unreadable(path, f"chunks of {chunk} points of {points}")
+        wrong = fixed and (chunks > points // chunk + 1 or chunk * length > max(MODEST, points * length))
+        if not 0 <= chunks <= size or wrong or not chunk:  # memory for whole chunks is allocated
+            raise _unreadable(path, f"a chunk table of {chunks} chunks of {chunk} points at byte {table}")
         with _reading(path):
             _check_chunks(path, file, (start, table), head[at + 52 :], length)
 

@@ -171,10 +171,7 @@ def _size(frame: _Frame, image: Path) -> tuple[int, int]:
 
 
 def _matrix(value: Any, named: str) -> Float64 | None:
-    """A rigid pose ``(4, 4)`` from the lists of a file; None if it is null or holds a number that is not finite.
-
-    A common scale of its axes, which moves no ray, is dropped.
-    """
+    """A rigid pose ``(4, 4)`` without the axes' common scale, which moves no ray; None if it is null or not finite."""
     if value is None:
         return None
     try:
