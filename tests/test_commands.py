@@ -73,6 +73,7 @@ SMALLEST = {  # by what a line begins with, or holds
     "mplicits offset *": "--resolution 24",
     "mplicits offset * --shell *": "--by -0.25",  # more than two of these cells
     "mplicits scene *": "--views 3 --size 16 --samples 1",
+    "mplicits scene * -o photos *": "--views 12",  # two of them see the same place
     "python -m benchmarks reconstruct *": f"{RECONSTRUCT} --views 4 --size 16 --test-every 2 --test-views 1"
     " --no-equal-time --resolution 16 --eval-samples 500",
     "python -m benchmarks reconstruct * --geometry-only *": "--rates 1e-3 --seeds 2 --geometries neus",
@@ -122,7 +123,7 @@ def views(path: Path, *, form: str = "transforms", count: int = 4) -> None:
 
 
 def cameras(path: Path) -> None:
-    views(path.parent / "viewed", count=14)  # docs/rendering.md asks for the one with the number 12
+    views(path.parent / "viewed", count=14)  # docs/pictures.md uses number 12
     shutil.copy(path.parent / "viewed" / path.name, path)
 
 
@@ -276,7 +277,7 @@ def is_bench(line: str) -> bool:
     return line.startswith(f"{BENCHMARKS.name} ")
 
 
-LONG = ("animate", "evolve")  # pages whose lines train the most; the tour has the first of each
+LONG = ("motion",)  # the page whose lines train the most
 
 LINES = [
     pytest.param(

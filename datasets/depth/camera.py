@@ -102,11 +102,11 @@ class DepthCamera:
 def read_intrinsics(path: str | Path, *, size: tuple[int, int] | None = None) -> DepthCamera:
     """Read the intrinsics of a depth camera.
 
-    - JSON and YAML: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``, and if known ``depth_scale`` and the
-      distortion ``k1``, ``k2``, ``p1``, ``p2``, ``k3`` (ours, and Polycam's); or with a matrix instead of the four
-      numbers, by rows or by columns: Open3D's intrinsics and camera parameters, Record3D's metadata, ROS's camera
-      information and OpenCV's calibration.
-    - text: four numbers fx fy cx cy, or a matrix of 3 × 3 or more.
+    - JSON and YAML with numbers (ours, Polycam's): ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``. Optional
+      are ``depth_scale`` and the distortion ``k1``, ``k2``, ``p1``, ``p2``, ``k3``.
+    - JSON and YAML with a matrix, by rows or by columns. Read are Open3D's intrinsics and camera parameters,
+      Record3D's metadata, ROS's camera information and OpenCV's calibration.
+    - Text: four numbers fx fy cx cy, or a matrix of 3 × 3 or more.
 
     Args:
         path: the file.

@@ -30,8 +30,8 @@ SMOOTHING = SmoothingOptions()
 def _breaks(depth: Float64, axis: int, *, pixel_angle: float, jump: float, incidence: float) -> Mask:
     """Breaks of the surface between neighbours along ``axis``; one shorter than ``depth`` along it.
 
-    A step is a break if it is longer than the sum of three: ``jump`` times the nearer depth, the step of a plane at
-    ``incidence``, and 1.5 times the smaller of the steps before and after it with its sign (a steep floor continues).
+    A step is a break if it is longer than the sum of three lengths. These are ``jump`` times the nearer depth, the step
+    of a plane at ``incidence``, and 1.5 times the smaller step of the same sign beside it (a steep floor continues).
     """
     z = np.moveaxis(depth, axis, 1)
     step = np.diff(z, axis=1)

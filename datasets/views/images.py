@@ -257,8 +257,9 @@ def read_cameras(path: str | Path) -> list[tuple[str, Camera]]:
       may stand at the top or in a frame. Without ``w`` and ``h`` the size is that of the image.
     - ``*.npz``: NeuS and IDR; ``world_mat_i`` projects onto pixels and is decomposed. The i-th image in name order of
       the folder ``image`` beside the file gives name and size.
-    - a folder: one of these in it (cameras_sphere.npz, transforms.json, transforms_train.json), or a COLMAP model,
-      text or binary: the largest in ``sparse/*``, or that in ``sparse`` or the folder itself.
+
+    In a folder the first of cameras_sphere.npz, transforms.json and transforms_train.json is read. Otherwise it is a
+    COLMAP model, text or binary: the largest in ``sparse/*``, or that in ``sparse`` or the folder itself.
 
     Raises:
         InputError: the file is missing, damaged or of another kind, or a camera in it is impossible.

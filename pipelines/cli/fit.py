@@ -45,7 +45,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("clouds", nargs="+", metavar="CLOUD", help=f"{what}; several clouds get a run each, RUN/NAME")
     add_new_run(parser, "directory of the run, or runs")
-    add("--jobs", type=whole(1), metavar="N", help="several clouds: so many at a time; above 1 needs mplicits[ray]")
+    add("--jobs", type=whole(1), metavar="N", help="several clouds: fits at a time; above 1 needs mplicits[ray]")
     what = "then learn the colours, if there are any, and write the mesh (.ply, .obj, .stl, .glb)"
     add("--mesh", type=Path, metavar="FILE", help=what)
     add("--no-colors", action="store_true", help="leave the colours out of --mesh")
@@ -282,7 +282,7 @@ def _describe_level(level: Any, stage: dict[str, Any]) -> str:
     if "training_seconds" in stage:
         text += f"; {stage['steps']:,} steps in {stage['training_seconds']:.1f} s"
     review = stage.get("review", {})
-    for name, what in (("dropped_outliers", "strays dropped"), ("turned_normals", "normals turned round")):
+    for name, what in (("dropped_outliers", "outliers dropped"), ("turned_normals", "normals turned round")):
         if review.get(name):
             text += f"; by it {review[name]:,} {what}"
     if "rms_at_points" in stage:
@@ -291,6 +291,8 @@ def _describe_level(level: Any, stage: dict[str, Any]) -> str:
 
 
 def _describe_record(record: dict[str, Any], path: Path) -> Rows:
+    from ...datasets import CleaningReport
+
     if not record:
         return []
     rows: Rows = [("fitted to", str(record.get("cloud", "?")))]
@@ -300,11 +302,8 @@ def _describe_record(record: dict[str, Any], path: Path) -> Rows:
     if record.get("reading"):
         rows.append(("read", record["reading"]))
     if cleaning:
-        points = f"{cleaning['kept']:,} of {cleaning['read']:,}, normals {cleaning['normals_source']}"
-        for name, what in (("dropped_outliers", "strays dropped"), ("turned_normals", "normals turned round")):
-            if cleaning.get(name):
-                points += f", {cleaning[name]:,} {what}"
-        rows.append(("points", points))
+        known = {name: cleaning[name] for name in CleaningReport.__dataclass_fields__ if name in cleaning}
+        rows.append(("points", CleaningReport(**known).summary()))
     signs = record.get("signs")
     if signs:
         rows.append(("signs", _describe_signs(signs, cleaning.get("kept", 0))))
@@ -337,9 +336,9 @@ def _describe_state(record: dict[str, Any], path: Path) -> str:
 
 def _describe_signs(signs: dict[str, Any], count: int) -> str:
     if signs["clear"]:
-        what = f"level 0, which was not told, turned {signs['turned_normals']:,} of {count:,} normals"
+        what = f"level 0, trained without orientation, turned {signs['turned_normals']:,} of {count:,} normals"
     else:
-        what = "level 0, which was not told, saw no in- and outside: normals stay as they were oriented"
+        what = "level 0, trained without orientation, found no inside: normals keep their estimated signs"
     return f"{what} (slope along them {signs['slope']:.2f})"
 
 

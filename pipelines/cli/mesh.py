@@ -67,7 +67,7 @@ def _mesh(arguments: argparse.Namespace) -> int:
 
 MESH = Command(
     "extract a mesh from a fit",
-    """  mplicits mesh runs/scan -o scan.ply --resolution 512
+    """  mplicits mesh runs/scan -o scan_mesh.ply --resolution 512
   mplicits mesh runs/scan -o coarse.obj --level 0
   mplicits mesh runs/scan -o scan.glb --keep-largest --trim-distance 0.01
   mplicits mesh runs/scan -o scan.glb --up z --unit mm --center
@@ -111,8 +111,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 EVALUATE = Command(
     "measure a mesh against a reference",
-    """  mplicits evaluate scan.ply truth.ply
-  mplicits evaluate scan.ply points.xyz --samples 100000 --json figures.json
+    """  mplicits evaluate scan_mesh.ply truth.ply
+  mplicits evaluate scan_mesh.ply points.xyz --samples 100000 --json figures.json
   mplicits evaluate runs/statue/mesh.ply photos/surface.ply --photos photos""",
     _evaluate_arguments,
     _evaluate,
@@ -201,8 +201,8 @@ def _offset(arguments: argparse.Namespace) -> int:
 
 OFFSET = Command(
     "grow, shrink or hollow a fit by a length",
-    """  mplicits offset runs/scan --by 2mm --unit m -o larger.ply
-  mplicits offset runs/scan --by -0.02 --shell -o hollow.stl
+    """  mplicits offset runs/scan --by 2mm --unit mm -o larger.ply
+  mplicits offset runs/scan --by -0.02 -o smaller.ply
   mplicits offset part.stl --by -2mm --shell --unit mm -o hollow.stl""",
     _offset_arguments,
     _offset,

@@ -271,8 +271,10 @@ def _tell_evolution(record: dict[str, Any]) -> None:
     steps = sum(stage["steps"] for stage in record["stages"])
     print(f"{record['kind']} of {', '.join(record['shapes'])}: {steps:,} steps in {record['training_seconds']:.0f} s")
     for end in checks["ends"]:
-        ratio = "no surface" if end["ratio"] is None else f"Chamfer {end['chamfer']:.2e}, {end['ratio']:.2f} floors"
-        print(f"  t = {end['time']:g}, {end['name']}: mean |f| {end['mean_value']:.1e}, {ratio}")
+        far = "no surface"
+        if end["ratio"] is not None:
+            far = f"Chamfer {end['chamfer']:.2e}, {end['ratio']:.2f} times the sampling floor"
+        print(f"  t = {end['time']:g}, {end['name']}: mean |f| {end['mean_value']:.1e}, {far}")
     frames, slopes = checks["frames"], checks["slopes"]
     counts, volumes = ([frame[name] for frame in frames] for name in ("components", "volume"))
     print(f"  {len(frames)} frames: volume {min(volumes):.3g} to {max(volumes):.3g}, components {_runs(counts)}")

@@ -127,7 +127,7 @@ def warnings(checks: dict[str, Any]) -> list[str]:
         # A surface that shall be met counts as missed where its Chamfer distance is so much above what it would score
         # itself.
         if end["ratio"] is None or end["ratio"] > 1.5:
-            how = "nothing is there" if end["ratio"] is None else f"Chamfer {end['ratio']:.2f} times its floor"
+            how = "nothing is there" if end["ratio"] is None else f"Chamfer {end['ratio']:.2f} times the sampling floor"
             found.append(f"{end['name']} is not met at t = {end['time']:g} ({how}); train longer (--steps)")
     return found
 

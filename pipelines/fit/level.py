@@ -189,8 +189,8 @@ class Verdict(NamedTuple):
         distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}{{}} ({_sure(fall)})" for b, a, fall, unit in pairs)
         errors = f"mean distance {distance.format('')}, mean angle of the normals {angle.format('°')}"
         if self.learns and max(self.fall) <= JUDGE.surely:
-            errors += f"; at those that it has learnt from the root mean square is {self.learnt:.2f} of what it was"
-        return f"level {level} {judged}: without it → with it, at {self.points:,} points that it has not seen: {errors}"
+            errors += f"; at the points it was trained on the root mean square is {self.learnt:.2f} of what it was"
+        return f"level {level} {judged}: without it → with it, at {self.points:,} points held out: {errors}"
 
     def record(self, level: int, *, scale: float = 1.0) -> dict[str, Any]:
         """For ``run.json``, with distances in input units and angles in degrees."""
@@ -209,8 +209,8 @@ class Verdict(NamedTuple):
 
 def _sure(fall: float, options: JudgeOptions = JUDGE) -> str:
     if abs(fall) <= options.surely:
-        return "no sure difference"
-    return "surely less" if fall > 0 else "surely more"
+        return "no significant difference"
+    return "significantly less" if fall > 0 else "significantly more"
 
 
 class Each(NamedTuple):

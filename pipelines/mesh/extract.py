@@ -154,8 +154,8 @@ def export_run(
         say: called with a line about removed parts, about changed coordinates and about a decimation.
 
     Raises:
-        InputError: there is no such run or level, it has no surface, the file cannot be written, or an option does not
-            go with another.
+        InputError: there is no such run or level, it has no surface, the file cannot be written or is the run's cloud,
+            or an option does not go with another.
     """
     options = options or MeshOptions()
     check = check_mesh_path if options.texture is None else check_textured_path
@@ -170,6 +170,9 @@ def export_run(
         check_tools("--faces", "fast_simplification")
     file = find_field(run)
     field, similarity, metadata = load_still(file, options.time)
+    cloud = metadata.get("run", {}).get("cloud")
+    if cloud and Path(out).resolve() == Path(cloud).resolve():
+        raise InputError(f"{out}: is the cloud that the run was fitted to; name another file")
     check(out, similarity, centered=placement.center)  # again: not every format can hold every place
     level = chosen_level(field, file, options.level)
     normal_level = chosen_level(field, file, options.normal_level, otherwise=level, flag="--normal-level")

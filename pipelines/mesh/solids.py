@@ -178,7 +178,7 @@ def offset(
     if shell and cells < CELLS_IN_WALL:
         enough = math.ceil(CELLS_IN_WALL * 2 * HALF_BOX * size / abs(length))
         raise InputError(
-            f"--by {by}: a wall of {cells:.2f} cells, too few to be closed; take --resolution {enough} or more"
+            f"--by {by}: a wall of {cells:.2f} cells, too few to close; take a thicker one, or --resolution {enough}"
         )
     shape = _measured(operand, options, say)
     fields, frame = in_one_frame([shape], margin=max(length, 0.0))

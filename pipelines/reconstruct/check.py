@@ -262,7 +262,7 @@ def format_check(images: PosedImages, check: CameraCheck, sizes: Sequence[tuple[
         *[images.reading] * bool(images.reading),
         f"region of interest: centre ({center}), radius {scale:.{digits}f}; from {images.region}",
         f"field of view: {_range(across, '.1f', '°')} across, {_range(down, '.1f', '°')} down",
-        f"eyes: {_range(check.distances, '.2f')} radii from the centre",
+        f"camera distances: {_range(check.distances, '.2f')} radii from the centre",
         f"share of the region's sphere in view: {_range(100 * check.in_view, '.0f', ' %')}",
     ]
     if images.points is not None and check.points_inside is not None:

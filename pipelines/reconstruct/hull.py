@@ -314,8 +314,8 @@ def carve(
     """Signed distances to the carved unit ball at the vertices of a grid over [−1, 1]³, negative inside.
 
     A vertex of the unit ball is inside where `HullOptions.agree` of the views that see it find object within half a
-    cell, so that thin parts stay; without views, where ``empty`` ``(E, E, E)``, a grid over the same cube, does not
-    exclude it. Grids of half as many cells come first, so that most vertices are decided by a few.
+    cell, so that thin parts stay. A vertex that no view sees is inside unless ``empty`` ``(E, E, E)``, a grid over the
+    same cube, excludes it. Grids of half as many cells come first, so that most vertices are decided by a few.
 
     Returns:
         ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; None where too little or too much of

@@ -166,7 +166,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         pool = RayPool(self.train_views, images.similarity, device, whole=whole, left_out=self.holes)
         measured = MeasuredDepths(self.train_views, images, device, seed=config.seed) if config.depth_weight else None
         self.measured = measured or None
-        with reported(report, "a surface to begin with"):
+        with reported(report, "initial surface"):
             self.start = (
                 "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured, agreement)
             )
@@ -245,7 +245,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         """Measure, colour, write."""
         pairs = self._render_held_out()
         record = self.record(finished=True) | {"held_out": self._figures(pairs)}
-        with reported(self.report, "what photographs see"):
+        with reported(self.report, "visible surface"):
             points, within = visible_points(self.model.geometry, self._masked_cameras())
             if len(points):
                 self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), visible_within=within))

@@ -102,7 +102,7 @@ def evaluate_files(
         raise InputError(f"{mesh}: holds points but no faces, so it is no mesh to evaluate; give the mesh first")
     truth = read_surface(reference)
     if view_counts is not None and not len(truth.faces):
-        raise InputError(f"{reference}: points hide nothing, so nobody knows what photographs see of them; give a mesh")
+        raise InputError(f"{reference}: holds points, whose visibility in photographs is unknown; give a mesh")
     return evaluate_surfaces(surface, truth, samples=samples, seed=seed, view_counts=view_counts)
 
 
@@ -238,7 +238,7 @@ def _iou(mesh: Mesh, reference: Mesh, columns: int, *, closed: bool) -> tuple[fl
     if not volumes.union > 0 or volumes.broken > 0.1:
         share = f"{volumes.broken:.0%} of the columns enter and leave a different number of times"
         return None, [f"no iou: {' and '.join(holes) or 'a surface'} is not closed ({share})"]
-    note = f"{' and '.join(holes)} not closed: iou leaves out {volumes.broken:.2%} of the columns"
+    note = f"not closed: {' and '.join(holes)}; iou leaves out {volumes.broken:.2%} of the columns"
     return volumes.intersection / volumes.union, [note] if holes else []
 
 

@@ -179,9 +179,9 @@ def drop_unsupported(
 ) -> Supported:
     """Drop the connected components that no input points ``(N, 3)`` support: blobs, where nothing was measured.
 
-    A component is kept if at least the share ``least`` of its area has its corners within ``radius`` (by default
-    `support_radius`) of some point, and at least three points are nearest to it, or half of those that so large an area
-    has elsewhere. If none is kept, all stay: mesh and points do not belong together.
+    A component is kept on two conditions. At least the share ``least`` of its area has its corners within ``radius``
+    (by default `support_radius`) of some point. At least three points are nearest to it, or half of those that an area
+    of this size has elsewhere. If none is kept, all stay: mesh and points do not belong together.
 
     A part that was measured has nearly all of its area near points, an open scan that the fit closed behind a third; a
     blob has none, or what a stray point or a neighbouring part touches. Raises a ValueError without points or radius.

@@ -208,6 +208,8 @@ def _read_preset(preset: str | Path | None, thing: str) -> tuple[str, Mapping[An
         pairs = yaml.safe_load(file.read_text(encoding="utf-8"))
         if not isinstance(pairs, dict | None):
             raise TypeError(f"it is a {type(pairs).__name__}")
+    except FileNotFoundError:
+        raise input_error(f"{source}: no such file; check the path") from None
     except Exception as error:  # YAML raises errors of many kinds, as for a date of the 45th of May
         reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())[:160]
         raise input_error(f"{source}: cannot be read as lines of 'key: value' ({reason})") from error

@@ -48,16 +48,16 @@ class CleaningReport:
 
     read: int
     kept: int
-    dropped_nan: int
-    dropped_duplicates: int
-    dropped_isolated: int
-    dropped_outliers: int
-    repaired_normals: int
-    dropped_normals: int
-    turned_normals: int
-    normals_source: Literal["file", "mesh", "estimated"]
-    flipped: bool
-    pieces: int
+    dropped_nan: int = 0
+    dropped_duplicates: int = 0
+    dropped_isolated: int = 0
+    dropped_outliers: int = 0
+    repaired_normals: int = 0
+    dropped_normals: int = 0
+    turned_normals: int = 0
+    normals_source: Literal["file", "mesh", "estimated"] = "file"
+    flipped: bool = False
+    pieces: int = 0
     smoothed_noise: float = 0.0
     oriented_by: Literal["winding", "propagation", "sensor", "level"] | None = None
     noise_deviation: float = 0.0
@@ -71,7 +71,7 @@ class CleaningReport:
             "winding": "by winding numbers",
             "propagation": "from point to point" + f" in {self.pieces:,} separate pieces" * (self.pieces > 1),
             "sensor": "towards the sensor",
-            "level": "by level 0, which was not told",
+            "level": "by level 0, trained without orientation",
         }
         if self.oriented_by:
             parts.append(f"oriented {ways[self.oriented_by]}")

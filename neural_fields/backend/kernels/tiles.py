@@ -1,11 +1,10 @@
 """Value and gradient of a network of any width for a tile of points, in IEEE float32.
 
 A tile is a matrix of ROWS points. Products are made COLUMNS units at a time, in an accumulator (ROWS, COLUMNS) in
-registers, PIECE inner units after PIECE. Where it is as wide as the network (up to 128 units), less is kept:
-
-- The first sine layer is never kept: each piece of it is made from the points when a product needs it.
-- The last one goes from its accumulator into the output's sum.
-- The first layer's cosines are made again from the points for the end of the sweep back.
+registers, PIECE inner units after PIECE. Where it is as wide as the network (up to 128 units), less is kept.
+The first sine layer is never kept: each piece of it is made from the points when a product needs it.
+The last one goes from its accumulator into the output's sum.
+The first layer's cosines are made again from the points for the end of the sweep back.
 
 Other matrices lie in a scratch of the program's own: `planes` of ROWS times its width. Layer i is in plane i mod 2 on
 both sweeps; the cosines of the layers between first and last follow. Products read a plane piece by piece, in a loop:

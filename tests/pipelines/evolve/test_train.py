@@ -95,7 +95,7 @@ def test_empty_frames_and_missed_ends_are_warned_about():
     others = torch.rand(100, 3)
     end = End("ball", 0.0, 0.5 * points, 0.5 * others)
     wrong = check_evolution(ShrinkingSphere(radius=0.8, alpha=0.1), [end], frames=2, resolution=24)
-    assert "times its floor" in wrong["warnings"][0]
+    assert "sampling floor" in wrong["warnings"][0]
 
 
 def test_a_run_holds_its_field_and_its_record(finished: Path):

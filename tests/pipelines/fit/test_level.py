@@ -208,7 +208,7 @@ def test_a_level_is_kept_if_it_is_surely_better() -> None:
 def test_a_verdict_in_words_and_numbers() -> None:
     verdict = verdict_of(3.0, 0.0, 0.5)
     words = verdict.words(2, scale=10.0)
-    for part in ("level 2", "50% of its steps", "distance 0.1 → 0.02 (surely less)", "3 → 1.5° (no sure difference)"):
+    for part in ("level 2", "50%", "0.1 → 0.02 (significantly less)", "3 → 1.5° (no significant difference)"):
         assert part in words
     assert "0.70" in verdict_of(1.5, 1.5)._replace(learnt=0.7).words(1)
     record = verdict.record(1, scale=10.0)

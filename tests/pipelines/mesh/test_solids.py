@@ -154,8 +154,8 @@ def test_lengths(text: str, unit: str | None, expected: float):
         ("offset a.safetensors --by 2parsec -o o.stl", "--by 2parsec: expected a number of input units"),
         ("offset a.safetensors --by 0 -o o.stl", "--by 0: expected a length other than 0"),
         ("offset a.safetensors --by -40 -o o.stl --resolution 16", "nothing is left"),
-        ("offset a.safetensors --by 2 --shell -o o.stl --resolution 40", "of 0.95 cells, too few to be closed; "),
-        ("offset a.safetensors --by -2 --shell -o o.stl --resolution 40", "--resolution 81 or more"),
+        ("offset a.safetensors --by 2 --shell -o o.stl --resolution 40", "of 0.95 cells"),
+        ("offset a.safetensors --by -2 --shell -o o.stl --resolution 40", "--resolution 81"),
         ("offset a.safetensors --by 2 --time 0.5 -o o.stl", "does not move"),
     ],
 )

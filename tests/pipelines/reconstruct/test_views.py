@@ -311,4 +311,4 @@ def test_evaluate_tells_how_near_the_mesh_is_where_photographs_see(
     assert json.loads(figures.read_text())["visible"]["share"] == pytest.approx(twice, abs=0.05)
     np.savetxt(cloud, np.random.default_rng(0).normal(size=(50, 3)))
     assert main(["evaluate", str(truth), str(cloud), *some]) == 2
-    assert f"{cloud}: points hide nothing" in capsys.readouterr().err
+    assert f"{cloud}: holds points" in capsys.readouterr().err
