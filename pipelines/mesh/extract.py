@@ -170,8 +170,8 @@ def export_run(
         check_tools("--faces", "fast_simplification")
     file = find_field(run)
     field, similarity, metadata = load_still(file, options.time)
-    cloud = metadata.get("run", {}).get("cloud")
-    if cloud and Path(out).resolve() == Path(cloud).resolve():
+    clouds = [metadata.get("run", {}).get(name) for name in ("cloud", "cloud_from_run")]
+    if any(cloud and (file.parent / cloud).resolve() == Path(out).resolve() for cloud in clouds):
         raise InputError(f"{out}: is the cloud that the run was fitted to; name another file")
     check(out, similarity, centered=placement.center)  # again: not every format can hold every place
     level = chosen_level(field, file, options.level)
@@ -217,8 +217,7 @@ def export_run(
     if line is not None and say is not None:
         say(f"coordinates: {line}")
     if options.texture is not None:
-        _write_textured(out, mesh, field, colors, similarity, options, options.texture)
-        return Exported(mesh)
+        return Exported(_write_textured(out, mesh, field, colors, similarity, options, options.texture))
     if colors is not None:
         mesh = dataclasses.replace(mesh, colors=_evaluated(colors, mesh.vertices))
     write_mesh(out, mesh, similarity, placement)
@@ -298,10 +297,10 @@ def _write_textured(
     similarity: Similarity,
     options: MeshOptions,
     size: int,
-) -> None:
-    """Bake the colours, if there are any, and the normals of ``options.normal_level``, by default the finest."""
+) -> Mesh:
+    """Bake the colours, if any, and normals of ``options.normal_level``, by default the finest → the written mesh."""
     level = field.num_levels - 1 if options.normal_level is None else options.normal_level
-    textured_mesh(
+    return textured_mesh(
         out,
         mesh,
         similarity,
