@@ -53,11 +53,7 @@ class DepthCamera:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"{name}={value}: expected a finite number > 0")
-        for name, value in (
-            ("cx", self.cx),
-            ("cy", self.cy),
-            *zip(COEFFICIENTS[:5], self.distortion, strict=True),
-        ):
+        for name, value in (("cx", self.cx), ("cy", self.cy), *zip(COEFFICIENTS[:5], self.distortion, strict=True)):
             if not math.isfinite(value):
                 raise ValueError(f"{name}={value}: expected a finite number")
 
@@ -166,7 +162,7 @@ _DISTORTIONS = ("distortion_coefficients", "dist_coeffs", "D", "d")
 
 def _from_text(text: str, path: Path) -> Any:
     """YAML with names, or bare numbers."""
-    words = re.sub(r"#.*", "", text).replace(",", " ").split()
+    words = re.sub(r"#.*|[][,]", " ", text).split()
     try:
         numbers = [float(word) for word in words]
     except ValueError:

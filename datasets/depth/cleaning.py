@@ -135,12 +135,7 @@ def smoothing_radius(noise: float, pixel_angle: float, *, tilt: float = 3.0) -> 
 
 
 def smooth_depth(
-    depth: Float64,
-    radius: int,
-    *,
-    noise: float,
-    color: NDArray[np.uint8] | None = None,
-    contrast: float = 30.0,
+    depth: Float64, radius: int, *, noise: float, color: NDArray[np.uint8] | None = None, contrast: float = 30.0
 ) -> Float64:
     """Average inverse depths, which are linear on planes, by a joint bilateral filter; NaN where ``depth`` is.
 

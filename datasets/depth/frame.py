@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in
 from ..cameras import Camera
-from ..files import decoded, finite_number, read_json, readable, reader
-from ..views.images import read_cameras
+from ..files import decoded, read_json, readable, reader
+from ..views.images import read_shots
 from .camera import DepthCamera, read_intrinsics
 from .images import fit_color, read_color, read_depth
 
@@ -141,7 +141,9 @@ def _file_poses(path: Path) -> list[PosedFrame]:
     if path.suffix.lower() == ".json" or path.name == "metadata":
         return _json_poses(path)
     with readable(path):
-        text = re.sub(r"#.*", "", decoded(path.read_bytes())).replace(",", " ")
+        text = decoded(path.read_bytes())
+    w_first = re.search(r"\bq\w*w\b.*\bq\w*x\b", text, re.IGNORECASE) is not None  # in a comment on the columns
+    text = re.sub(r"#.*", "", text).replace(",", " ")
     lines = [line.split() for line in text.splitlines() if line.strip()]
     try:
         rows = [[float(word) for word in words] for words in lines]
@@ -154,7 +156,7 @@ def _file_poses(path: Path) -> list[PosedFrame]:
     elif widths == [4] * 4 or widths == [4] * 3:
         matrices = [rows]
     elif rows and set(widths) == {8}:
-        matrices = [_from_quaternion(row[1:4], row[4:]) for row in rows]
+        matrices = [_from_quaternion(row[1:4], np.roll(row[4:], -1 if w_first else 0)) for row in rows]
         names = [words[0] for words in lines]
     elif rows and set(widths) in ({12}, {16}):
         matrices = [np.reshape(row, (-1, 4)) for row in rows]
@@ -168,9 +170,12 @@ def _json_poses(path: Path) -> list[PosedFrame]:
     content = read_json(path)
     content = content if isinstance(content, dict) else {}
     if "frames" in content:
+        placed = ((shot.name, shot.placed) for shot in read_shots(path))
         return [
-            (name, camera.world_from_camera.numpy(), DepthCamera.from_camera(camera))
-            for name, camera in read_cameras(path)
+            (name, np.full((4, 4), np.nan), None)
+            if camera is None
+            else (name, camera.world_from_camera.numpy(), DepthCamera.from_camera(camera))
+            for name, camera in placed
         ]
     found: list[PosedFrame] = []
     if "t_00" in content:  # Polycam
@@ -179,8 +184,8 @@ def _json_poses(path: Path) -> list[PosedFrame]:
     elif isinstance(content.get("poses"), list):  # Record3D; its lens is that of the pictures
         for index, pose in enumerate(content["poses"]):
             named = f"{path}: poses[{index}]"
-            numbers = [finite_number(x, named) for x in pose] if isinstance(pose, list) else []
-            if len(numbers) != 7:
+            numbers = pose if isinstance(pose, list) and len(pose) == 7 else []
+            if not all(isinstance(x, int | float) for x in numbers) or not numbers:
                 raise InputError(f"{named}: expected qx, qy, qz, qw, tx, ty, tz")
             found.append((f"{index}", _rigid(_from_quaternion(numbers[4:], numbers[:4]), named, _OPENGL), None))
     else:  # Open3D: from world to camera, by columns
@@ -193,10 +198,10 @@ def _json_poses(path: Path) -> list[PosedFrame]:
     return found
 
 
-def _from_quaternion(place: list[float], quaternion: list[float]) -> Float64:
+def _from_quaternion(place: Sequence[float], quaternion: ArrayLike) -> Float64:
     pose = np.eye(4)
     pose[:3, 3] = place
-    if np.isfinite(quaternion).all() and any(quaternion):
+    if np.isfinite(quaternion).all() and np.any(quaternion):
         pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()  # x, y, z, w, of any length
     else:
         pose[:3, :3] = np.nan

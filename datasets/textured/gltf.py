@@ -22,17 +22,19 @@ from scipy.spatial.transform import Rotation
 from ...neural_fields import InputError
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ...neural_fields.meshing.glb import GENERATOR
+from ..files import MODEST
 from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+Pose = tuple[list[float], Float64]  # of a mesh: weights of its morph targets, and matrices (J, 4, 4) of joints or node
 
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-# Extensions that change the place of the numbers; others change the look only.
-_FOREIGN = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu")
+# Extensions that a file may require: those that are read, and those that change the look only.
+_KNOWN = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", "KHR_materials_", "KHR_lights_punctual")
 
 
 class _Piece(NamedTuple):
@@ -52,9 +54,10 @@ def read_gltf(path: Path, *, textures: bool = True) -> TexturedMesh:
     """
     try:
         document = _Document.load(path)
-        needed = next((name for name in _FOREIGN if name in document.header.get("extensionsRequired", ())), None)
-        if needed is not None:
-            raise InputError(f"{path}: extensionsRequired: {needed} is not read; export it without compression")
+        needed = [name for name in document.header.get("extensionsRequired", ()) if not name.startswith(_KNOWN)]
+        needed += [name for name in document.header.get("extensionsUsed", ()) if name == "EXT_mesh_gpu_instancing"]
+        if needed:
+            raise InputError(f"{path}: the extension {needed[0]} is not read; export it without (or uncompressed)")
         materials: dict[str, Paint] = {}
         pieces = list(_pieces(document, materials, textures=textures))
         mesh = _joined(pieces, list(materials.values()), str(path))
@@ -115,22 +118,29 @@ class _Document:
     def accessor(self, number: int) -> NDArray[Any]:
         """An accessor → ``(count, width)``; normalised integers become fractions."""
         accessor = self.header["accessors"][number]
-        if "sparse" in accessor or "bufferView" not in accessor:
-            raise ValueError("sparse accessors are not read")
-        data, start, stride = self.view(accessor["bufferView"])
         kind, width = np.dtype(_KINDS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
-        rows = np.ndarray(
-            (_whole(accessor, "count"), width),
-            kind,
-            data,
-            start + _whole(accessor, "byteOffset"),
-            (stride or width * kind.itemsize, kind.itemsize),
-        )
+        count, sparse = _whole(accessor, "count"), accessor.get("sparse")
+        if "bufferView" in accessor:
+            rows = self.rows(accessor, count, kind, width)
+        elif sparse is None or count * width * kind.itemsize > MODEST:
+            raise ValueError(f"accessors[{number}] has no numbers; are they compressed?")
+        else:
+            rows = np.zeros((count, width), kind)
+        if sparse is not None:
+            changed, rows = _whole(sparse, "count"), rows.copy()
+            places = self.rows(sparse["indices"], changed, np.dtype(_KINDS[sparse["indices"]["componentType"]]), 1)
+            rows[places[:, 0]] = self.rows(sparse["values"], changed, kind, width)
         if kind.kind == "f" and not np.isfinite(rows).all():
             raise ValueError(f"accessors[{number}] has a number that is not finite")
         if accessor.get("normalized", False):
             return (rows / np.float64(np.iinfo(kind).max)).clip(-1, 1)
         return rows
+
+    def rows(self, record: dict[str, Any], count: int, kind: np.dtype[Any], width: int) -> NDArray[Any]:
+        """``(count, width)`` numbers of a bufferView."""
+        data, start, stride = self.view(record["bufferView"])
+        strides = (stride or width * kind.itemsize, kind.itemsize)
+        return np.ndarray((count, width), kind, data, start + _whole(record, "byteOffset"), strides)
 
     def image(self, number: int) -> NDArray[np.float32]:
         image = self.header["images"][number]
@@ -169,23 +179,43 @@ def _pieces(document: _Document, materials: dict[str, Paint], *, textures: bool)
         roots = header["scenes"][header.get("scene", 0)].get("nodes", [])
     ours = header.get("asset", {}).get("generator") == GENERATOR
     open_nodes = [(root, np.eye(4)) for root in roots]
-    visits = 0
+    places: dict[int, Float64] = {}  # of nodes
     while open_nodes:
         number, parent = open_nodes.pop(0)
-        visits += 1
-        if visits > len(nodes):
+        if number in places:
             raise ValueError("a node is its own ancestor, or has two parents")
-        node = nodes[number]
-        placed = parent @ _transform(node, ours=ours)
-        open_nodes += [(child, placed) for child in node.get("children", [])]
-        if "mesh" not in node:
-            continue
-        for primitive in header["meshes"][node["mesh"]]["primitives"]:
-            if (
-                primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
-                and "POSITION" in primitive["attributes"]
-            ):
-                yield _piece(document, primitive, placed, materials, textures=textures)
+        places[number] = parent @ _transform(nodes[number], ours=ours)
+        open_nodes += [(child, places[number]) for child in nodes[number].get("children", [])]
+    for node, placed in ((nodes[number], placed) for number, placed in places.items()):
+        mesh = header["meshes"][node["mesh"]] if "mesh" in node else {"primitives": []}
+        weights, joints = node.get("weights", mesh.get("weights", [])), placed[None]
+        if "skin" in node:  # whose joints place the mesh, and its node does not
+            skin = header["skins"][node["skin"]]
+            joints = np.stack([places[number] for number in skin["joints"]])
+            if "inverseBindMatrices" in skin:
+                bound = document.accessor(skin["inverseBindMatrices"])[: len(joints)]
+                joints = joints @ bound.reshape(-1, 4, 4).swapaxes(1, 2)
+        for primitive in mesh["primitives"]:
+            if _TRIANGLES <= primitive.get("mode", _TRIANGLES) <= _FAN and "POSITION" in primitive["attributes"]:
+                yield _piece(document, primitive, (weights, joints), materials, textures=textures)
+
+
+def _posed(document: _Document, primitive: dict[str, Any], pose: Pose) -> tuple[Float64, bool]:
+    """The vertices of a primitive in the scene, in the pose at rest, and whether it is mirrored there."""
+    attributes, (shares, joints) = primitive["attributes"], pose
+    vertices = document.accessor(attributes["POSITION"]).astype(np.float64)
+    for weight, target in zip(shares, primitive.get("targets", []), strict=False):
+        if "POSITION" in target:
+            vertices += _finite(weight, "weights") * document.accessor(target["POSITION"])
+    if "JOINTS_0" not in attributes or len(joints) == 1:
+        placed = joints[0]
+        return vertices @ placed[:3, :3].T + placed[:3, 3], bool(np.linalg.det(placed[:3, :3]) < 0)
+    sets = range(sum(name.startswith("JOINTS_") for name in attributes))
+    weights = np.hstack([document.accessor(attributes[f"WEIGHTS_{k}"]) for k in sets]).astype(np.float64)
+    used = np.hstack([document.accessor(attributes[f"JOINTS_{k}"]) for k in sets])
+    weights /= np.where(weights.any(axis=1), weights.sum(axis=1), 1)[:, None]
+    placed = np.einsum("nk,nkij->nij", weights, joints[used])
+    return np.einsum("nij,nj->ni", placed[:, :3, :3], vertices) + placed[:, :3, 3], False
 
 
 def _transform(node: dict[str, Any], *, ours: bool) -> Float64:
@@ -202,10 +232,10 @@ def _transform(node: dict[str, Any], *, ours: bool) -> Float64:
 
 
 def _piece(
-    document: _Document, primitive: dict[str, Any], placed: Float64, materials: dict[str, Paint], *, textures: bool
+    document: _Document, primitive: dict[str, Any], pose: Pose, materials: dict[str, Paint], *, textures: bool
 ) -> _Piece:
     attributes = primitive["attributes"]
-    vertices = document.accessor(attributes["POSITION"]).astype(np.float64) @ placed[:3, :3].T + placed[:3, 3]
+    vertices, mirrored = _posed(document, primitive, pose)
     count = len(vertices)
     order = np.arange(count)
     if "indices" in primitive:
@@ -213,7 +243,7 @@ def _piece(
     faces = _triangles(order, primitive.get("mode", _TRIANGLES))
     if len(faces) and faces.max() >= count:
         raise ValueError(f"a face names vertex {faces.max()}, but there are only {count}")
-    if np.linalg.det(placed[:3, :3]) < 0:  # a mirrored node shows the other side of its triangles
+    if mirrored:  # a mirrored node shows the other side of its triangles
         faces = faces[:, ::-1]
     colors = None
     if "COLOR_0" in attributes:

@@ -85,6 +85,7 @@ def read_posed_images(
 ) -> PosedImages:
     """Read photographs, their cameras, masks and depth maps, and find the region of the object.
 
+    Photographs without a finite pose are left out, and counted in ``reading``.
     Lens distortion is taken out of the pictures, and the cameras are those of the new pictures. If a picture is larger
     or smaller than its file of cameras says, both sides by one factor, its camera is resized. A picture's mask is the
     file that goes with it, or its transparency. Masks that are white in all views are ignored.
@@ -121,9 +122,9 @@ def _posed(
     points, observations = (read_colmap_points(source) if source.is_dir() else None) or (None, None)
     maps = find_depth_maps(shots, depths)
     shots = [replace(shot, depth=path) for shot, path in zip(shots, maps, strict=True)]
-    whole = [not _missing(shot) for shot in shots]
+    whole = [shot.placed is not None and not _missing(shot) for shot in shots]
     if not allow_missing:
-        _check_files(shots)
+        _check_files([shot for shot in shots if shot.placed is not None])
     reading = _counted(source, shots, sum(whole), allow_missing=allow_missing)
     if not all(whole):
         shots = [shot for shot, kept in zip(shots, whole, strict=True) if kept]
@@ -156,10 +157,13 @@ def _counted(source: Path, shots: Sequence[Shot], placed: int, *, allow_missing:
         extras = {file for shot in shots for file in (shot.mask, shot.depth) if file is not None}
         photographs = len((listed - extras) | {shot.image for shot in shots})
     reading = f"{placed} of {photographs} photographs have a camera"
+    if lost := sum(shot.placed is None for shot in shots):
+        reading += f" (the poses of {lost} are not finite)"
     if source.is_dir() and len(models := find_models(source.parent.parent)) > 1 and source in models:
         reading += f" in sparse/{source.name}, the largest of {len(models)} models"
     if not placed or (2 * placed < photographs and not allow_missing):
-        fix = "find the others' cameras, or go on with --allow-missing" if placed else "add the photographs"
+        fix = "find the cameras again" if lost else "add the photographs"
+        fix = "find the others' cameras, or go on with --allow-missing" if placed else fix
         raise InputError(f"{source}: only {reading}; {fix}")
     return reading
 
@@ -245,6 +249,7 @@ def read_cameras(path: str | Path) -> list[tuple[str, Camera]]:
     """Read the cameras of posed images, with the images' names, in the file's own world coordinates.
 
     Lens distortion is ignored: the cameras are those of undistorted images. `read_posed_images` undistorts both.
+    Photographs whose pose is not finite, as trackers write it where they lost the camera, are left out.
 
     - ``*.json``: transforms.json of nerfstudio, instant-ngp and the Blender scenes of NeRF. ``transform_matrix`` is
       the pose in OpenGL's convention (x right, y up, z backward) and becomes OpenCV's. The focal length is ``fl_x``,
@@ -259,7 +264,11 @@ def read_cameras(path: str | Path) -> list[tuple[str, Camera]]:
     Raises:
         InputError: the file is missing, damaged or of another kind, or a camera in it is impossible.
     """
-    return [(shot.name, shot.camera.pinhole()) for shot in read_shots(find_source(path))]
+    source = find_source(path)
+    placed = [(shot.name, shot.placed.pinhole()) for shot in read_shots(source) if shot.placed is not None]
+    if not placed:
+        raise InputError(f"{source}: no pose in it is finite; find the cameras again")
+    return placed
 
 
 def find_source(path: str | Path) -> Path:

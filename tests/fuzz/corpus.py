@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -68,12 +69,20 @@ def _clouds(folder: Path) -> Iterator[Specimen]:
         yield Specimen(name, (folder / name).read_bytes(), datasets.read_cloud)
     import laspy
 
-    las = laspy.create(point_format=3, file_version="1.2")
-    las.x, las.y, las.z = points.T
-    las.red, las.green, las.blue = (colors.T * 65535).astype(np.uint16)
-    for name in ("cloud.las", "cloud.laz"):
-        las.write(folder / name)
-        yield Specimen(name, (folder / name).read_bytes(), datasets.read_cloud)
+    for form, version, names in ((3, "1.2", ("cloud.las", "cloud.laz")), (7, "1.4", ("layered.laz",))):
+        las = laspy.create(point_format=form, file_version=version)
+        las.x, las.y, las.z = points.T
+        las.red, las.green, las.blue = (colors.T * 65535).astype(np.uint16)
+        for name in names:
+            las.write(folder / name)
+            yield Specimen(name, (folder / name).read_bytes(), datasets.read_cloud)
+    import pye57
+
+    with patch("uuid.uuid4", return_value="0"):
+        scan = pye57.E57(str(folder / "cloud.e57"), mode="w")
+        scan.write_scan_raw({f"cartesian{axis}": column for axis, column in zip("XYZ", points.T, strict=True)})
+        scan.close()
+    yield Specimen("cloud.e57", (folder / "cloud.e57").read_bytes(), datasets.read_cloud)
     for kind in ("ascii", "binary", "binary_compressed"):
         yield Specimen(f"{kind}.pcd", _pcd(kind, np.hstack((points, normals)).astype("<f4")), datasets.read_cloud)
 

@@ -64,19 +64,19 @@ class Table:
 
 # Names without case, units, marks, and the words `_FILLERS`; what comes first counts.
 _NAMES = {
-    "points": ("x y z", "px py pz", "easting northing elevation", "easting northing height", "e n h"),
-    "normals": ("nx ny nz", "xn yn zn", "normal0 normal1 normal2"),
-    "colors": ("red green blue", "r g b", "red8 green8 blue8", "r8 g8 b8", "red16 green16 blue16", "r16 g16 b16"),
+    "points": ("x y z", "px py pz", "easting northing elevation", "easting northing height", "e n h", "0 1 2"),
+    "normals": ("nx ny nz", "xn yn zn", "normal0 normal1 normal2", "normals0 normals1 normals2"),
+    "colors": ("red green blue", "r g b", "rf gf bf", "rgb0 rgb1 rgb2", "colors0 colors1 colors2"),
 }
 _FILLERS = re.compile(
-    r"scalar|cartesian|diffuse|vertex|point|position|pos|coordinates?|coord|color|colour|channel|value"
+    r"scalar|cartesian|diffuse|vertex|points?|position|pos|coordinates?|coord|color|colour|channel|value"
 )
 
 
 def _plain(name: str) -> str:
     """``"Normal X"``, ``NormalX``, ``normal_x``, ``N_x`` → ``nx``; ``"X [m]"`` → ``x``; ``"Red (0-255)"`` → ``red``."""
     name = re.sub(r"[\[({<].*?[\])}>]", "", name.strip().strip("\"'")).casefold()
-    name = re.sub(r"[^a-z0-9]", "", name)
+    name = re.sub(r"[^a-z0-9]|(?<=[a-z_ ])(8|16)$", "", name)  # red_16
     name = re.sub(r"^(normals?|norm)(?=[xyz]$)|(?<=^[xyz])(normals?|norm)$", "n", name)
     return _FILLERS.sub("", name) or name
 

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ....neural_fields import InputError
+from ...files import MODEST
 from ..point_cloud import PointCloud, colors_from
 from .columns import CloudStream, Layout, RawRows, Table, describe_layout, named_layout
 
 # Of the public header (LAS 1.4 R15, 2.4): version, sizes, how many records and points; the last part is of 1.4 alone.
 _VERSION = struct.Struct("<BB"), 24
 _SIZES = struct.Struct("<HIIBHI"), 94
+_SCALES = struct.Struct("<3d"), 131
 _SIZES_14 = struct.Struct("<QIQ"), 235
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of LASzip's items by their kind; extra bytes (14) have one for each byte
 
 
 class LasStream(CloudStream):
@@ -109,7 +113,7 @@ def _check_sizes(path: Path) -> None:
     if head[:4] != b"LASF" or len(head) < 227:
         raise InputError(f"{path}: not a readable LAS file (no header); export it again")
     header, start, records, form, length, points = _at(head, _SIZES)
-    late_start, late = size, 0
+    (late_start, late), scales = (size, 0), _at(head, _SCALES)
     if _at(head, _VERSION) >= (1, 4) and len(head) == 375:
         late_start, late, points = _at(head, _SIZES_14)
     compressed = bool(form & 0x80)
@@ -121,6 +125,8 @@ def _check_sizes(path: Path) -> None:
         if records * 54 > start - header  # bytes of a record without its content; of a late one, 60
         else f"byte 105: points of {length} bytes"
         if length < 20
+        else f"byte 131: scales {scales}"
+        if not all(0 < abs(scale) < math.inf for scale in scales)
         else f"byte 243: {late} records after the points, from byte {late_start} of {size}"
         if late and late_start + late * 60 > size
         else f"{points} points in {room} bytes"
@@ -130,10 +136,10 @@ def _check_sizes(path: Path) -> None:
     if wrong:
         raise _unreadable(path, wrong)
     if compressed and points:
-        _check_laz(path, start, points)
+        _check_laz(path, start, points, length)
 
 
-def _check_laz(path: Path, start: int, points: int) -> None:
+def _check_laz(path: Path, start: int, points: int, length: int) -> None:
     """Refuse LAZ on which the decompressor would abort or loop: old compressors, and impossible chunk tables.
 
     Layout (LASzip, "laszip.hpp"): the LASzip record is one of the variable-length records. At ``start`` is the place of
@@ -156,8 +162,37 @@ def _check_laz(path: Path, start: int, points: int) -> None:
         entry = file.read(8)
         chunks = int.from_bytes(entry[4:], "little") if len(entry) == 8 else -1
         fixed = chunk not in (0, 2**32 - 1)
-        if not 0 <= chunks <= size or (fixed and chunks > points // chunk + 1) or not chunk:
-            raise _unreadable(path, f"a chunk table of {chunks} chunks at byte {table}")
+        wrong = fixed and (chunks > points // chunk + 1 or chunk * length > max(MODEST, points * length))
+        if not 0 <= chunks <= size or wrong or not chunk:  # memory for whole chunks is allocated
+            raise _unreadable(path, f"a chunk table of {chunks} chunks of {chunk} points at byte {table}")
+        with _reading(path):
+            _check_chunks(path, file, (start, table), head[at + 52 :], length)
+
+
+def _check_chunks(path: Path, file: BinaryIO, place: tuple[int, int], record: bytes, length: int) -> None:
+    """Refuse points, chunks and layers that claim more than what holds them has: the decompressor would allocate it.
+
+    The record lists the items of a point; a layered chunk begins with a point, their count, and the layers' sizes.
+    """
+    try:
+        import lazrs
+    except ImportError:  # laspy then uses LASzip itself
+        return
+    (at, end), compressor = place, record[0]
+    (count,) = struct.unpack_from("<H", record, 32)
+    items = list(struct.iter_unpack("<HHH", record[34 : 34 + 6 * count]))  # kind, size, version
+    layers = sum(_LAYERS.get(kind, size) for kind, size, _ in items) if compressor == 3 else 0
+    if (whole := sum(size for _, size, _ in items)) != length:
+        raise _unreadable(path, f"a LASzip record of points of {whole} bytes, not {length}")
+    file.seek(at)
+    layout = lazrs.LazVlr(record[: 34 + 6 * count])  # pyright: ignore[reportAttributeAccessIssue]
+    at += 8
+    for number, (_, size) in enumerate(lazrs.read_chunk_table(file, layout)):  # pyright: ignore
+        file.seek(at + length + 4)
+        claimed = sum(struct.unpack(f"<{layers}I", file.read(4 * layers))) if size else 0
+        at += size
+        if at > end or claimed > size:
+            raise _unreadable(path, f"chunk {number} claims {max(size, claimed)} bytes")
 
 
 @contextmanager
@@ -171,7 +206,7 @@ def _reading(path: Path) -> Iterator[None]:
         raise _unreadable(path, (str(error).splitlines() or [type(error).__name__])[0]) from error
 
 
-def _at(head: bytes, field: tuple[struct.Struct, int]) -> tuple[int, ...]:
+def _at(head: bytes, field: tuple[struct.Struct, int]) -> tuple[Any, ...]:
     form, offset = field
     return form.unpack_from(head, offset)
 

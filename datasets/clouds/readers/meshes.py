@@ -26,11 +26,12 @@ def read_stl(path: Path) -> tuple[PointCloud, Int64]:
     """The triangles of an STL file, text of any number of solids or binary; equal corners become one vertex."""
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
-    if len(data) >= 84 and len(data) == 84 + 50 * count:
+    if count and 0 <= len(data) - 84 - 50 * count < 50:  # some writers add a few bytes
         facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
         corners = np.frombuffer(data, facet, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
     elif re.match(r"\s*solid\b", text := decoded(data), re.IGNORECASE):
-        found = re.findall(r"^\s*vertex\s+([^\n]*)", text, re.MULTILINE | re.IGNORECASE)
+        text = re.sub(r"^[ \t]*(end)?solid\b[^\n]*", "", text, flags=re.MULTILINE | re.IGNORECASE)  # may name anything
+        found = re.findall(r"\bvertex\s+(\S+[ \t]+\S+[ \t]+\S+)", text, re.IGNORECASE)
         corners = numbers("\n".join(found), path, first_line=1, what="vertex") if found else np.empty((0, 3))
     else:
         raise InputError(f"{path}: not a readable STL file; check its extension or export it again")
@@ -152,7 +153,7 @@ class ObjText:
         if table.shape[1] > 4:
             bare = np.isnan(table[:, 3])  # white, where others have colours
             self.colors = np.where(bare[:, None], np.float32(1), colors_from(table[:, 3:6]))
-        polygons, polygon_starts = self.records("f")
+        polygons, polygon_starts = self.records("fo?")  # fo: an older word
         self.lengths = np.array([len(polygon.split()) for polygon in polygons], np.int64)
         self.words = " ".join(polygons)
         self.used_at = np.repeat(polygon_starts, self.lengths)

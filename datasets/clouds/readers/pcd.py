@@ -46,8 +46,9 @@ def read_pcd(path: Path, columns: str | None = None) -> PointCloud:
     table_names: list[str] = []
     values: list[NDArray[Any]] = []
     for name, field in zip(names, fields, strict=True):
-        if name.lower() in ("rgb", "rgba") and field.shape[1:] == (1,) and field.dtype.itemsize == 4:
-            packed = np.ascontiguousarray(field[:, 0]).view(np.uint32)
+        if name.lower() in ("rgb", "rgba") and field.shape[1:] == (1,) and field.dtype.itemsize >= 4:
+            whole = field.dtype.kind != "f" or bool((field >= 1).any() and (field % 1 == 0).all())
+            packed = field[:, 0].astype(np.int64 if whole else np.float32).view(np.int64 if whole else np.uint32)
             table_names += ["red", "green", "blue"]
             values += [(packed >> shift & 255).astype(np.uint8) for shift in (16, 8, 0)]
         elif field.shape[1] == 1:

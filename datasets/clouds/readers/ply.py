@@ -31,6 +31,7 @@ _KINDS = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
+_INDICES = ("vertex_indices", "vertex_index")
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -87,12 +88,18 @@ def _read(path: Path, columns: str | None, *, meshes: bool) -> tuple[PointCloud,
             cloud = cloud_from(table, choose_layout(table, columns))
             if not meshes and cloud.normals is not None:
                 break  # nothing that follows is needed
-        elif element.name in ("face", "tristrips"):
-            faces.append(_faces(found, triangulate if element.name == "face" else strips))
+        elif _has_faces(element):
+            faces.append(_faces(found, strips if element.name == "tristrips" else triangulate))
     if cloud is None:
         raise InputError(f"{path}: vertex: the header declares no such element; export it as a point cloud")
     triangles = np.concatenate(faces)
     return as_mesh(cloud, triangles) if len(triangles) else cloud, triangles
+
+
+def _has_faces(element: _Element) -> bool:
+    """Whether rows are faces: by the usual names of the element, or of a list in it."""
+    names = {p.name.lower() for p in element.properties if p.length_kind}
+    return element.name in ("face", "tristrips") or not names.isdisjoint(_INDICES)
 
 
 def _faces(
@@ -100,7 +107,7 @@ def _faces(
 ) -> NDArray[np.int64]:
     """Triangles ``(F, 3)`` from the list of vertices: the one of the usual name, or else the first."""
     lists = {name.lower(): column for name, column in columns.items() if isinstance(column, _Lists)}
-    usual = [lists[name] for name in ("vertex_indices", "vertex_index") if name in lists]
+    usual = [lists[name] for name in _INDICES if name in lists]
     found = usual or [column for name, column in lists.items() if "tex" not in name]
     if not found:
         return np.empty((0, 3), np.int64)
@@ -126,7 +133,7 @@ def ply_stream(path: Path, columns: str | None = None) -> TableStream | None:
     row = np.dtype([(p.name, _ORDERS[encoding] + p.kind) for p in vertex.properties])
     table = Table(path, [np.empty(0, row[k]) for k in range(len(names))], names, "vertex: ")
     layout = choose_layout(table, columns)
-    if layout.normals is None and any(element.name in ("face", "tristrips") for element in elements):
+    if layout.normals is None and any(map(_has_faces, elements)):
         return None
     return TableStream(table, offset=body, row=row, count=vertex.count, layout=layout)
 

@@ -23,8 +23,7 @@ def read_text(path: Path, columns: str | None = None) -> PointCloud:
 
     A line before the numbers may name the columns (see `choose_layout`). The counts of points in PTS files are skipped.
     """
-    data = path.read_bytes()
-    text = decoded(data)
+    text = re.sub(r'"([-+]?[.,]?\d[-+.,\deE]*)"', r"\1", decoded(path.read_bytes()))  # quoted numbers
     if "\0" in text:
         raise InputError(f"{path}: holds binary data, not text; check its extension")
     lines = text.split("\n")
@@ -42,6 +41,8 @@ def read_text(path: Path, columns: str | None = None) -> PointCloud:
         raise InputError(f"{path}: no numbers in it; export it again")
     separator, decimal = _dialect(first)
     body = "\n".join(lines[skipped:])
+    if (s := separator) in (",", ";") and any(m in f"\n{body}\n" for m in (s + s, f"{s} {s}", f"\n{s}", f"{s}\n")):
+        body = re.sub(rf"^ *(?={s})|(?<={s}) *(?={s}|$)", "nan", body, flags=re.MULTILINE)  # empty fields
     if count:
         body = re.sub(r"^[ \t]*\d+[ \t]*$", "", body, flags=re.MULTILINE)
     if any(mark in body for mark in ";%!"):
@@ -49,6 +50,9 @@ def read_text(path: Path, columns: str | None = None) -> PointCloud:
     body = body.replace("//", "#").replace(",", decimal).replace(";", " ")
     rows = numbers(body, path, first_line=skipped + 1, what="line")
     names = next(filter(None, (_names(head, separator, rows.shape[1]) for head in reversed(heads))), None)
+    if names is None and s in (",", ";") and np.isnan(rows[:, -1]).all():  # lines end with a separator
+        rows = rows[:, :-1]
+        names = next(filter(None, (_names(head, separator, rows.shape[1]) for head in reversed(heads))), None)
     table = Table(path, rows, names, f"line {skipped + 1}: ")
     scanner = path.suffix.lower() == ".pts" or count
     return cloud_from(table, choose_layout(table, columns, scanner=scanner))
@@ -154,6 +158,7 @@ def npy_stream(path: Path, columns: str | None = None) -> TableStream | None:
 # Names of arrays, without case and underscores, and the columns that they hold.
 _ARRAYS = {
     **dict.fromkeys(("points", "point", "xyz", "positions", "pos", "vertices", "verts", "coords", "pts"), "xyz"),
+    **dict.fromkeys(("pointcloud", "cloud", "data", "arr0"), "xyz"),
     **dict.fromkeys(("normals", "normal", "vertexnormals", "pointnormals"), ("nx", "ny", "nz")),
     **dict.fromkeys(("colors", "color", "colours", "colour", "rgb", "rgba", "vertexcolors"), ("r", "g", "b")),
 }
@@ -169,8 +174,11 @@ def read_npz(path: Path, columns: str | None = None) -> PointCloud:
         plain = re.sub(r"[\W_]", "", name).casefold()
         return tuple(_ARRAYS[plain]) if plain in _ARRAYS else None
 
+    ignored: list[str] = []
+
     def choose(names: list[str]) -> list[str]:
         roles = [known(name) for name in names]
+        ignored[:] = [name for name, role in zip(names, roles, strict=True) if role is None]
         chosen = [name for k, name in enumerate(names) if roles[k] is not None and roles[k] not in roles[:k]]
         if ("x", "y", "z") in roles:
             return chosen
@@ -202,5 +210,6 @@ def read_npz(path: Path, columns: str | None = None) -> PointCloud:
             values.append(array.ravel())
     if len({len(value) for value in values}) > 1:
         raise InputError(f"{path}: its arrays have different lengths; expected one number of each per point")
-    table = Table(path, values, names)
+    notes = (f"ignored arrays: {', '.join(ignored)}",) * bool(ignored and first is not None)
+    table = Table(path, values, names, notes=notes)
     return cloud_from(table, choose_layout(table, columns))

@@ -104,7 +104,7 @@ def read_colmap(model: Path) -> list[Shot]:
         if pose.lens not in lenses:
             raise InputError(f"{named}: its camera {pose.lens} is not in {cameras.name}; export both again")
         lens = lenses[pose.lens]
-        camera = _camera(lens, pose, f"{cameras}: camera {pose.lens}", named)
+        camera = _camera(lens, pose, f"{cameras}: camera {pose.lens}")
         mask = None if masks is None else _mask(masks, pose.name)
         shots.append(Shot(pose.name, camera, folder / pose.name, mask, named))
     return shots
@@ -158,20 +158,20 @@ def _mask(folder: Path, name: str) -> Path:
     return next((file for file in files if file.is_file()), files[0])
 
 
-def _camera(lens: _Lens, pose: _Pose, named_lens: str, named: str) -> Camera:
-    """A camera with its lens: COLMAP's coefficients are those of OpenCV, in its order."""
+def _camera(lens: _Lens, pose: _Pose, named: str) -> Camera | None:
+    """A camera with its lens: COLMAP's coefficients are those of OpenCV, in its order. None without a finite pose."""
     if lens.model not in PINHOLES:
-        raise InputError(f"{named_lens}: {lens.model}: no pinhole; run colmap image_undistorter and use its output")
+        raise InputError(f"{named}: {lens.model}: no pinhole; run colmap image_undistorter and use its output")
     if len(lens.numbers) != MODELS[lens.model]:
-        raise InputError(f"{named_lens}: {len(lens.numbers)} numbers; {lens.model} has {MODELS[lens.model]}")
+        raise InputError(f"{named}: {len(lens.numbers)} numbers; {lens.model} has {MODELS[lens.model]}")
     numbers = lens.numbers[:1] + lens.numbers if lens.model in ONE_FOCAL else lens.numbers
     fx, fy, cx, cy = numbers[:4]
     if not np.isfinite(numbers).all() or min(fx, fy, lens.width, lens.height) <= 0:
         expected = "expected finite numbers, and sizes and focal lengths above 0"
-        raise InputError(f"{named_lens}: {lens.width} × {lens.height}, {lens.numbers}; {expected}")
+        raise InputError(f"{named}: {lens.width} × {lens.height}, {lens.numbers}; {expected}")
     quaternion, shift = np.array(pose.quaternion), np.array(pose.shift)
     if not (np.isfinite(quaternion).all() and np.isfinite(shift).all() and quaternion.any()):
-        raise InputError(f"{named}: its pose is zero or not finite; leave that image out")
+        return None
     rotation = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()  # camera from world
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation.T, -rotation.T @ shift

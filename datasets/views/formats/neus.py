@@ -79,13 +79,13 @@ def _files(path: Path, folders: Sequence[str]) -> list[Path]:
     return next(filter(None, (list_images(path.parent / folder) for folder in folders)), [])
 
 
-def _camera(matrix: NDArray[Any], size: tuple[int, int], named: str) -> Camera:
-    """The camera of ``P = K R [I | −eye]``, which maps homogeneous world points to pixels."""
+def _camera(matrix: NDArray[Any], size: tuple[int, int], named: str) -> Camera | None:
+    """The camera of ``P = K R [I | −eye]``, which maps homogeneous world points to pixels; None if not finite."""
     if matrix.shape not in ((4, 4), (3, 4)) or matrix.dtype.kind not in "fiu":
         raise InputError(f"{named}: {matrix.dtype} of shape {matrix.shape}; expected numbers of shape (4, 4)")
     projection = matrix[:3].astype(np.float64)
     if not np.isfinite(projection).all():
-        raise InputError(f"{named}: holds a number that is not finite; leave that camera out")
+        return None
     if np.linalg.cond(projection[:, :3]) > 1e12:
         raise InputError(f"{named}: its left 3 × 3 part is singular; expected intrinsics times a rigid pose")
     # P and −P are one projection; only the one with a positive determinant has z forward.

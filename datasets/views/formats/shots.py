@@ -27,12 +27,18 @@ class Shot:
     """One photograph as a file of cameras describes it; the photograph itself is not read."""
 
     name: str  # of the image, as the file has it
-    camera: Camera  # with its lens
+    placed: Camera | None  # with its lens; None where the file has no finite pose for it
     image: Path  # where the photograph should be
     mask: Path | None
     named: str  # file and record, as the beginning of a message
     depth: Path | None = None
     depth_scale: float | None = None  # steps per unit of an integer depth map, if the file gives it; see `read_depth`
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of a photograph that has one."""
+        assert self.placed is not None, self.named
+        return self.placed
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ def _file_name(frame: _Frame, key: str) -> str | None:
     return name
 
 
-def _camera(frame: _Frame, image: Path) -> Camera:
+def _camera(frame: _Frame, image: Path) -> Camera | None:
     from kornia.geometry.conversions import camtoworld_graphics_to_vision_4x4  # here: it takes a fifth of a second
 
     lens = frame.get("camera_model")
@@ -132,7 +132,12 @@ def _camera(frame: _Frame, image: Path) -> Camera:
         raise InputError(f"{frame.named('fl_x')}: missing, and so is camera_angle_x; add one of them")
     cx, cy = frame.number("cx"), frame.number("cy")
     cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
-    pose = _matrix(frame.own.get("transform_matrix"), frame.named("transform_matrix"))
+    named = frame.named("transform_matrix")
+    if "transform_matrix" not in frame.own:
+        raise InputError(f"{named}: missing; add the pose of the camera, four rows of four numbers")
+    pose = _matrix(frame.own["transform_matrix"], named)
+    if pose is None:
+        return None
     turned = camtoworld_graphics_to_vision_4x4(torch.from_numpy(pose)[None])[0]
     matrix = intrinsics(fx, fx if fy is None else fy, cx - 0.5, cy - 0.5)
     return Camera(matrix, turned, width, height, _distortion(frame))
@@ -165,10 +170,10 @@ def _size(frame: _Frame, image: Path) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _matrix(value: Any, named: str) -> Float64:
-    """A rigid pose ``(4, 4)`` from the lists of a file; a common scale of its axes, which moves no ray, is dropped."""
+def _matrix(value: Any, named: str) -> Float64 | None:
+    """A rigid pose ``(4, 4)`` without the axes' common scale, which moves no ray; None if it is null or not finite."""
     if value is None:
-        raise InputError(f"{named}: missing; add the pose of the camera, four rows of four numbers")
+        return None
     try:
         matrix = np.asarray(value, np.float64)
     except (TypeError, ValueError) as error:
@@ -176,7 +181,7 @@ def _matrix(value: Any, named: str) -> Float64:
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"{named}: shape {matrix.shape}; expected (4, 4)")
     if not np.isfinite(matrix).all():
-        raise InputError(f"{named}: holds a number that is not finite; leave that frame out")
+        return None
     left, lengths, right = np.linalg.svd(matrix[:3, :3])
     axes = left @ right  # the nearest rotation: files have the digits of float32, or fewer
     if lengths[2] < (1 - OBLIQUE) * lengths[0] or not lengths[0] or np.linalg.det(axes) < 0:

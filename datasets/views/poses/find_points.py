@@ -62,7 +62,7 @@ def find_points(source: str | Path, project: str | Path, *, report: Report | Non
         InputError: the photographs cannot be read, the project is of something else, or no two photographs match.
     """
     source, project = find_source(source), Path(project)
-    shots = read_shots(source)
+    shots = [shot for shot in read_shots(source) if shot.placed is not None]
     check_colmap()
     files = [file for shot in shots for file in (shot.image, shot.mask, shot.depth) if file is not None]
     files += [source] if source.is_file() else files_in(source, (".bin", ".txt"))

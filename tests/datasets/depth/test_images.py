@@ -197,6 +197,7 @@ OPEN3D = {"class_name": "PinholeCameraParameters", "intrinsic": {"width": 8, "he
         ("ROS.yaml", ROS),
         ("OpenCV.yml", OPENCV),
         ("K.txt", "10 0 3.5\n0 11 2.25\n0 0 1\n"),
+        ("NumPy.txt", "[[10.0, 0, 3.5],\n [0, 11, 2.25],\n [0, 0, 1]]\n"),
         ("intrinsic_depth.txt", "10 0 3.5 0\n0 11 2.25 0\n0 0 1 0\n0 0 0 1\n"),
         ("four.txt", "# fx fy cx cy\n10, 11, 3.5, 2.25\n"),
     ],
@@ -270,18 +271,22 @@ def text(rows):
     return "".join(" ".join(f"{x:.12g}" for x in row) + "\n" for row in rows)
 
 
+W_FIRST = f"5.25 {text([[*POSE[:3, 3], *np.roll(QUATERNION, 1)]])}5.5 0 0 0 2 0 0 0\n"
+
+
 @pytest.mark.parametrize(
     ("files", "names"),
     [
         ({"trajectory.log": f"0 0 2\n{text(POSE)}\n1 1 2\n{text(np.eye(4))}"}, [None, None]),
         ({"tum.txt": f"# timestamp\n5.25 {text([[*POSE[:3, 3], *QUATERNION]])}5.5 0 0 0 0 0 0 2\n"}, ["5.25", "5.5"]),
+        ({"tum.txt": f"#timestamp [ns],p_x [m],p_y,p_z,q_w [],q_x,q_y,q_z\n{W_FIRST}"}, ["5.25", "5.5"]),
         ({"kitti.txt": text([POSE[:3].ravel(), np.eye(4)[:3].ravel()])}, [None, None]),
         ({"poses/2.txt": text(POSE), "poses/10.txt": text(np.eye(4)[:3]), "poses/.hidden.txt": "x"}, ["2", "10"]),
         ({"open3d.json": {"parameters": [{"extrinsic": e} for e in EXTRINSICS]}}, [None, None]),
         ({"metadata": {"K": COLUMNS, "poses": RECORD3D}}, ["0", "1"]),
         ({"cameras/7.json": polycam(OPENGL), "cameras/11.json": polycam(np.diag([1.0, -1, -1, 1]))}, ["7", "11"]),
     ],
-    ids=["Open3D log", "TUM", "KITTI", "folder", "Open3D JSON", "Record3D", "Polycam"],
+    ids=["Open3D log", "TUM", "w first", "KITTI", "folder", "Open3D JSON", "Record3D", "Polycam"],
 )
 def test_poses_of_other_programs_are_camera_to_world(tmp_path, files, names):
     paths = [write(tmp_path / name, content) for name, content in files.items()]
@@ -296,6 +301,10 @@ def test_poses_of_other_programs_are_camera_to_world(tmp_path, files, names):
 LOST = np.full((4, 4), -np.inf)  # as ScanNet writes it
 
 
+def frame(pose):
+    return {"file_path": "a.png", "transform_matrix": pose.tolist()}
+
+
 @pytest.mark.parametrize(
     "files",
     [
@@ -304,8 +313,10 @@ LOST = np.full((4, 4), -np.inf)  # as ScanNet writes it
         {"a.log": f"0 0 1\n{text(LOST)}\n1 1 1\n{text(POSE)}"},
         {"kitti.txt": text([np.full(12, np.nan), POSE[:3].ravel()])},
         {"tum.txt": text([[0, *[np.nan] * 7], [1, *POSE[:3, 3], *QUATERNION]])},
+        {"metadata": {"poses": [[np.nan] * 7, RECORD3D[0]]}},
+        {"transforms.json": {"w": 8, "h": 6, "fl_x": 9, "frames": [frame(LOST), frame(OPENGL)]}},
     ],
-    ids=["ScanNet", "with a last row", "Open3D log", "KITTI", "TUM"],
+    ids=["ScanNet", "with a last row", "Open3D log", "KITTI", "TUM", "Record3D", "transforms"],
 )
 def test_lost_frames_have_no_pose(tmp_path, files):
     paths = [write(tmp_path / name, content) for name, content in files.items()]

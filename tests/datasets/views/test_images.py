@@ -2,6 +2,7 @@
 
 import json
 import math
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import Camera, PosedImages, linear_to_srgb, look_at, read_posed_images, srgb_to_linear
+from mplicits.datasets import (
+    Camera,
+    PosedImages,
+    linear_to_srgb,
+    look_at,
+    read_cameras,
+    read_posed_images,
+    srgb_to_linear,
+)
 from mplicits.neural_fields import Similarity
 from photographs import changed_transforms, colmap_pose, project_by_opencv, projections, same_cameras, transforms
 from photographs import write_image as write
@@ -317,6 +326,80 @@ def test_photographs_without_a_camera_are_counted(tmp_path):
     read = read_posed_images(tmp_path, allow_missing=True)
     assert [view.name for view in read.views] == [f"{k}.png" for k in range(VIEWS) if k != 3]
     assert read.reading == "5 of 26 photographs have a camera"
+
+
+UNIT = Similarity((0.0, 0.0, 0.0), 1.0)
+
+
+def lose_in_transforms(folder: Path, numbers: list[int], value: float) -> None:
+    with changed_transforms(write_transforms(folder)) as content:
+        for index in numbers:
+            content["frames"][index]["transform_matrix"][0][3] = value
+
+
+def null_in_transforms(folder: Path, numbers: list[int], _: float) -> None:
+    with changed_transforms(write_transforms(folder)) as content:
+        for index in numbers:
+            content["frames"][index]["transform_matrix"] = None
+
+
+def lose_in_neus(folder: Path, numbers: list[int], value: float) -> None:
+    path = write_neus(folder, masks=False) / "cameras_sphere.npz"
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    np.savez(path, **arrays | {f"world_mat_{index}": np.full((4, 4), value) for index in numbers})
+
+
+def lose_in_colmap(folder: Path, numbers: list[int], value: float) -> None:
+    file = write_colmap(folder) / "sparse" / "0" / "images.txt"
+    lines = file.read_text().splitlines()
+    for index in numbers:
+        lines[2 * index] = f"{index} {' '.join([str(value)] * 4)} 0 0 3 1 {index}.png"
+    file.write_text("\n".join(lines))
+
+
+def lose_in_binary_colmap(folder: Path, numbers: list[int], value: float) -> None:
+    model = write_colmap(folder) / "sparse" / "0"
+    (model / "cameras.txt").unlink()
+    (model / "images.txt").unlink()
+    lens = struct.pack("<QIiQQ4d", 1, 1, 1, WIDTH, HEIGHT, 60, 58, 25, 17.5)
+    images = struct.pack("<Q", VIEWS)
+    for index, camera in enumerate(cameras()):
+        pose = [value if index in numbers else number for number in colmap_pose(camera)]
+        images += struct.pack("<I7dI", index, *pose, 1) + f"{index}.png".encode() + struct.pack("<xQ", 0)
+    (model / "cameras.bin").write_bytes(lens)
+    (model / "images.bin").write_bytes(images)
+
+
+@pytest.mark.parametrize("value", [math.nan, -math.inf])
+@pytest.mark.parametrize(
+    "lose", [lose_in_transforms, null_in_transforms, lose_in_neus, lose_in_colmap, lose_in_binary_colmap]
+)
+def test_photographs_whose_pose_is_lost_are_left_out_and_counted(tmp_path, lose, value):
+    lose(tmp_path / "few", [1, 4], value)
+    read = read_posed_images(tmp_path / "few")
+    assert [int(Path(view.name).stem) for view in read.views] == [0, 2, 3, 5]
+    assert read.reading.startswith("4 of 6 photographs have a camera")
+    same_cameras([view.camera for view in read.views], [cameras()[k] for k in (0, 2, 3, 5)])
+    same_cameras((camera for _, camera in read_cameras(tmp_path / "few")), [cameras()[k] for k in (0, 2, 3, 5)])
+    lose(tmp_path / "most", [0, 1, 3, 4], value)
+    with refused(tmp_path / "most", "2 of 6 photographs .*--allow-missing"):
+        read_posed_images(tmp_path / "most")
+    assert len(read_posed_images(tmp_path / "most", allow_missing=True, region=UNIT).views) == 2
+    lose(tmp_path / "all", [*range(VIEWS)], value)
+    for read_all in (read_cameras, read_posed_images):
+        with refused(tmp_path / "all", "finite"):
+            read_all(tmp_path / "all")
+
+
+def test_observations_go_with_the_photographs_that_stay(tmp_path):
+    lose_in_colmap(tmp_path, [2], math.nan)
+    tracks = [f"{k} 0.{k} 0 0 9 9 9 0.5 {k % VIEWS} 0 2 0 5 0\n" for k in range(12)]
+    (tmp_path / "sparse" / "0" / "points3D.txt").write_text("".join(tracks))
+    read = read_posed_images(tmp_path, region=UNIT)
+    kept = [0, 1, 3, 4, 5]
+    expected = [(kept.index(view), k) for k in range(12) for view in (k % VIEWS, 2, 5) if view != 2]
+    assert read.observations.tolist() == [list(pair) for pair in expected]
 
 
 def test_names_that_were_written_on_windows(tmp_path):

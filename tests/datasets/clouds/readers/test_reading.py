@@ -135,6 +135,34 @@ def test_off_with_normals_colors_and_faces(tmp_path):
     assert read_cloud(path).normals is None
 
 
+def test_stl_of_other_programs(tmp_path):
+    """Facets on one line, names of solids that look like vertices, and bytes after the last facet."""
+    vertices, faces = octasphere()
+    facets = solid("", vertices, faces).splitlines()[1:-1]
+    (tmp_path / "a.stl").write_text(f"solid vertex 1 2 3 of me\n{' '.join(facets)}\nendsolid\n")
+    ball(tmp_path / "a.stl")
+    data = trimesh.Trimesh(vertices, faces, process=False).export(file_type="stl")
+    for extra in (b"\0\0", b"made by"):
+        (tmp_path / "a.stl").write_bytes(data + extra)
+        ball(tmp_path / "a.stl")
+    (tmp_path / "a.stl").write_bytes(data + data[84:])  # twice the facets of its head
+    with refused(tmp_path / "a.stl", "STL"):
+        read_cloud(tmp_path / "a.stl")
+
+
+def test_faces_under_other_names(tmp_path):
+    vertices, faces = octasphere()
+    rows = "".join("{} {} {}\n".format(*vertex) for vertex in vertices)
+    corners = "".join("3 {} {} {}\n".format(*face) for face in faces)
+    head = ASCII + f"element vertex {len(vertices)}\n".encode() + XYZ + f"element faces {len(faces)}\n".encode()
+    head += b"property list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_bytes(head + (rows + corners).encode())
+    ball(tmp_path / "a.ply")
+    lines = [f"v {row}" for row in rows.splitlines()] + ["fo {} {} {}".format(*(face + 1)) for face in faces]
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    ball(tmp_path / "a.obj")
+
+
 def test_ply_triangle_strips(tmp_path):
     theta, phi = np.meshgrid(np.linspace(0.1, 3.04, 13), 2 * np.pi * np.arange(24) / 24, indexing="ij")
     vertices = np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1).reshape(-1, 3)
@@ -249,6 +277,28 @@ def test_laz_that_the_decompressor_cannot_take(tmp_path):
             assert str(error).startswith(f"{path}: not a readable LAS file")  # noqa: PT017
 
 
+@pytest.mark.parametrize("streamed", [False, True])
+def test_laz_that_claims_more_memory_than_it_has_points(tmp_path, streamed):
+    """Sizes that the decompressor allocates: of a chunk in points and bytes, of a point's items, of a layer."""
+    path = write_las(tmp_path / "cloud.laz", diagonal(400), form=7, version="1.4")
+    good = bytearray(path.read_bytes())
+    record, (start,) = good.find(b"laszip encoded") + 52, struct.unpack_from("<I", good, 96)
+    if streamed:  # the place of the chunk table is at the end
+        good += good[start : start + 8]
+        good[start : start + 8] = b"\xff" * 8
+    path.write_bytes(good)
+    assert len(read_cloud(path)) == 400
+    claims = [(record + 12, "<I", 2**31), (record + 32, "<H", 1), (record + 32, "<H", 9000), (record + 36, "<H", 9999)]
+    claims += [(start + 8 + 36 + 4 + 4 * layer, "<I", 2**32 - 1) for layer in range(10)]
+    for at, form, value in claims:
+        damaged = bytearray(good)
+        struct.pack_into(form, damaged, at, value)
+        path.write_bytes(damaged)
+        for read in (read_cloud, open_stream):
+            with refused(path, "not a readable LAS file"):
+                read(path)
+
+
 @pytest.mark.parametrize(
     ("at", "form", "value", "said"),
     [
@@ -256,6 +306,8 @@ def test_laz_that_the_decompressor_cannot_take(tmp_path):
         (96, "<I", 2**31, "byte 94: .*2147483648"),
         (100, "<I", 2**30, "byte 100: 1073741824 records"),
         (105, "<H", 3, "byte 105: points of 3 bytes"),
+        (139, "<d", 0.0, "byte 131: scales"),
+        (131, "<d", float("nan"), "byte 131: scales"),
         (235, "<Q", 2**60, "byte 243: .*1152921504606846976"),
         (247, "<Q", 2**40, "1099511627776 points"),
     ],
@@ -321,7 +373,7 @@ GRID = "\n".join(f"{i} {i * i} 1" for i in range(20))
         ("a.npz", b"PK\x03\x04 broken", "damaged or not a NumPy file"),
         ("a.npy", np.full((20, 3), None), "Python objects"),
         ("a.npy", np.zeros((20, 5)), r"shape \(20, 5\): 5 columns"),
-        ("a.npz", {"cloud": np.zeros((20, 3))}, "points: no such array"),
+        ("a.npz", {"thing": np.zeros((20, 3))}, "points: no such array"),
         ("a.npz", {"points": np.zeros((20, 2))}, r"points: shape \(20, 2\)"),
         ("a.npz", {"points": np.zeros((20, 3)), "normals": np.zeros((19, 3))}, r"normals: shape \(19, 3\)"),
         ("a.npz", {"points": np.full((20, 3), None)}, "points: holds Python objects"),

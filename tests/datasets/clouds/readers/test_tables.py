@@ -73,6 +73,13 @@ TEXTS = {
     "suffixes": ("a.txt", "x y z red_8 green_8 blue_8\n" + table(P, C), "c"),
     "underscores": ("a.txt", "pos_x pos_y pos_z normal_x normal_y normal_z diffuse_red diffuse_green diffuse_blue\n"
                     + table(P, N, C), "nc"),
+    "CloudCompare, fractions": ("a.txt", "//X Y Z Rf Gf Bf Nx Ny Nz\n" + table(P, C / 255, N), "nc"),
+    "ParaView": ("a.csv", '"Normals:0","Normals:1","Normals:2","Points:0","Points:1","Points:2"\n'
+                 + table(N, P, sep=","), "n"),
+    "empty fields": ("a.csv", "z,i,y,x\n" + "".join(f"{z},,{y},{x}\n" for x, y, z in P), ""),
+    "empty fields at the ends": ("a.csv", "id,z,y,x,i\n" + "".join(f",{z}, {y},{x},\n" for x, y, z in P), ""),
+    "some empty fields": ("a.csv", "x,y,z,i\n" + "".join(f"{x},{y},{z},{'' if y % 2 else 7}\n" for x, y, z in P), ""),
+    "quoted numbers": ("a.csv", "".join(f'"{x}","{y}","{z}"\n' for x, y, z in P), ""),
 }  # fmt: skip
 
 
@@ -210,21 +217,14 @@ def test_pcd(tmp_path, kind, packed):
         read_cloud(path)
 
 
-def test_e57(tmp_path):
-    pye57 = pytest.importorskip("pye57")
-    path = tmp_path / "a.e57"
-    file, middle = pye57.E57(str(path), mode="w"), P.mean(axis=0)  # what it writes are float32, moved by float64
-    for rows in (slice(0, 15), slice(15, COUNT)):
-        fields = {f"cartesian{a}": column for a, column in zip("XYZ", (P - middle)[rows].T, strict=True)}
-        shades = C[rows].astype(np.uint8).T
-        fields |= {f"color{a}": np.ascontiguousarray(s) for a, s in zip(("Red", "Green", "Blue"), shades, strict=True)}
-        fields |= {"intensity": np.ones(len(P[rows]))} if rows.start else {}
-        file.write_scan_raw(fields, rotation=np.array([1.0, 0, 0, 0]), translation=middle)
-    file.close()
-    assert "of some scans only, and ignored: intensity" in check(path, "c").reading
-    path.write_bytes(path.read_bytes()[:900])
-    with refused(path, "E57"):
-        read_cloud(path)
+@pytest.mark.parametrize(("size", "decimal"), [(4, True), (8, False), (8, True)])
+def test_pcd_colors_as_decimal_numbers_or_doubles(tmp_path, size, decimal):
+    whole = (C[:, 0] << 16 | C[:, 1] << 8 | C[:, 2]).astype("<u4")
+    shades = [f"{x:d}" if decimal else f"{x.view(np.float32):.9g}" for x in whole]
+    lines = "".join(f"{line} {shade}\n" for line, shade in zip(table(P).splitlines(), shades, strict=True))
+    head = f"VERSION .7\nFIELDS x y z rgb\nSIZE 8 8 8 {size}\nTYPE F F F F\nWIDTH {COUNT}\nHEIGHT 1\nDATA ascii\n"
+    (tmp_path / "a.pcd").write_text(head + lines)
+    check(tmp_path / "a.pcd", "c")
 
 
 def test_npy(tmp_path):
@@ -245,10 +245,12 @@ def test_npz(tmp_path):
         ({"xyz": P, "rgb": np.hstack((C, ONE)).astype(np.uint16)}, "c"),
         ({"Points": P, "Colors": C / 255}, "c"),
         ({"points": np.hstack((P, N))}, "n"),
+        ({"arr_0": np.hstack((P, N))}, "n"),
         ({**dict(zip("xyz", P.T, strict=True)), "intensity": I[:, 0]}, ""),
     ):
         np.savez(path, **arrays)
-        check(path, expected)
+        read = check(path, expected)
+        assert ("scan" in read.reading) == ("scan" in arrays)  # what is not read is said
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
