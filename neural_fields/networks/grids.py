@@ -15,12 +15,7 @@ INITIAL = 1e-4  # entries begin uniform in ±INITIAL (Sec. 4)
 
 
 def grid_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
-    """Cells along a side on each level, ``⌊N_min bˡ⌋`` with ``b = (N_max / N_min)^(1 / (L − 1))`` (Eqs. 2 and 3).
-
-    Example:
-        >>> grid_resolutions(4, 16, 128)
-        [16, 32, 64, 128]
-    """
+    """Cells along a side on each level, ``⌊N_min bˡ⌋`` with ``b = (N_max / N_min)^(1 / (L − 1))`` (Eqs. 2 and 3)."""
     growth = (finest / coarsest) ** (1 / max(1, levels - 1))
     # A power that should be whole may come out a rounding error below.
     return [math.floor(coarsest * growth**level * (1 + 1e-12)) for level in range(levels)]

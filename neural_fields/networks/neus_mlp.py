@@ -31,11 +31,6 @@ class NeusSDF(OneLevelField):
 
     Raises:
         ValueError: an argument is out of range.
-
-    Example:
-        >>> from mplicits.neural_fields.networks.neus_mlp import NeusSDF
-        >>> sum(p.numel() for p in NeusSDF().parameters())
-        529076
     """
 
     defined_by = ("width", "depth", "frequencies", "num_features")

@@ -61,10 +61,7 @@ class DynamicTracer:
         directions: ``(..., 3)`` of unit length. Rays ``(H, W, 3)`` of an image with one origin are traced in tiles
             first.
         level: whose surface to find.
-        tolerance: see `sphere_trace`.
-        resolution: see `sphere_trace`.
-        lipschitz: see `sphere_trace`.
-        radius: see `sphere_trace`.
+        tolerance, resolution, lipschitz, radius: see `sphere_trace`.
         reach: distance that is near; by default 12 resolutions. More makes key frames fewer and other frames dearer;
             with 0 every frame is a key frame.
         speed: bound on |∂f/∂t| near the surface; by default 1.25 times the largest measured around it at every key
@@ -72,15 +69,6 @@ class DynamicTracer:
 
     Raises:
         ValueError: the field is not four-dimensional, has no such level, or a number is negative.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Moving, RigidMotion, Sphere
-        >>> from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
-        >>> ball = Moving(Sphere(radius=0.3), RigidMotion(velocity=(0.0, 0.0, 0.5)))
-        >>> tracer = DynamicTracer(ball, torch.tensor([0.0, 0.0, -2.0]), torch.tensor([[0.0, 0.0, 1.0]]))
-        >>> [round(float(tracer.trace(t).depth), 4) for t in (0.0, 0.1, 0.2)]
-        [1.7, 1.75, 1.8]
     """
 
     def __init__(

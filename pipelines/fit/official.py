@@ -63,11 +63,8 @@ def read_siren(path: str | Path, *, w0: float = 1.0) -> Siren:
 
     Weights and biases come in the order of the file, whatever their names: ``net.0.0.weight`` of the paper's code,
     ``net.0.linear.weight`` of Sitzmann et al., or ``lin0.weight``. A dict may hold the state dict beside other things,
-    as ``model_state_dict``. Layers of different widths are filled up with neurons that are always zero.
-
-    Args:
-        path: the file; only tensors are read, no code runs (``weights_only``).
-        w0: the frequency ω₀ that its code multiplies by, outside the weights.
+    as ``model_state_dict``. Layers of different widths are filled up with neurons that are always zero. Only tensors
+    are read; no code runs. ``w0`` is the frequency ω₀ outside of the weights.
 
     Raises:
         InputError: there is no such file, or it holds anything else.
@@ -277,7 +274,7 @@ def export_official(run: str | Path, out: str | Path, *, up: str = "y") -> tuple
     for index, stage in enumerate(STAGES):
         level = levels[min(index, len(levels) - 1)]  # their renderer wants three, and repeats the last one
         weights = [part.detach().float().contiguous() for part in level.folded()]
-        weights[-2:] = weights[-2][:1], weights[-1][:1]  # without features, of which their format has none
+        weights[-2:] = weights[-2][:1], weights[-1][:1]  # their format has no features
         stem = f"{out.name}_{STAGES[min(index, len(levels) - 1)]}"
         if index < len(levels):
             keys = [f"net.{layer}.0.{name}" for layer in range(level.depth + 1) for name in ("weight", "bias")]

@@ -147,11 +147,7 @@ def export_run(
 ) -> Exported:
     """Extract the surface of a run and write it in the coordinates of its input, or as `Placement` says.
 
-    Args:
-        run: run directory or .safetensors file.
-        out: the mesh file.
-        options: how.
-        say: called with a line about removed parts, about changed coordinates and about a decimation.
+    ``say`` is called with a line about removed parts, about changed coordinates and about a decimation.
 
     Raises:
         InputError: there is no such run or level, it has no surface, the file cannot be written or is the run's cloud,

@@ -53,14 +53,8 @@ def write_mesh(
     PLY is binary, with double coordinates where float would spoil them, normals and colours; OBJ has normals and
     colours; STL (binary) neither. Colours are display numbers in PLY and OBJ, linear light in GLB. GLB is float32: far
     from the origin its coordinates are relative to ``similarity.center``, which the node's ``extras`` keep. The file
-    appears under its name only when it is complete.
-
-    Args:
-        path: the file.
-        mesh: in unit-sphere coordinates.
-        similarity: from input to unit-sphere coordinates; the identity if there is none.
-        placement: which axis is up in the input, its unit, and whether to centre the mesh. A GLB is y-up and in metres,
-            by its node; in other formats the coordinates change only as ``placement`` asks.
+    appears under its name only when it is complete. A GLB is y-up and in metres, by its node; in other formats the
+    coordinates change only as ``placement`` asks: which axis is up in the input, its unit, whether to centre the mesh.
 
     Raises:
         InputError: see `check_mesh_path`; or the disk is full.

@@ -74,9 +74,8 @@ def export_mesh(
         path: the file; its extension chooses the format.
         resolution: cells along the longest side of the scene box.
         level: of detail.
-        seen: leave out what fewer than two of the photographs that were trained on see; masks are not asked.
-        texture: texels along each side of two images, colours and normals, that take the place of vertex colours; for
-            GLB and OBJ, with ``mplicits[texture]``.
+        seen: leave out what fewer than two of the photographs that were trained on see; masks are ignored.
+        texture: texels along each side of an image of colours and one of normals, for GLB and OBJ.
         faces: triangles to keep below the texture.
 
     Raises:

@@ -185,26 +185,13 @@ def fit_texture(
 ) -> FittedTexture:
     """Train a texture field by the paper's 𝒯(φ): the colours at points, and none of their change along ∇f.
 
-    The geometry is frozen. Ctrl-C ends the training early and leaves what has been learnt.
-
-    Args:
-        geometry: f.
-        cloud: points with colours, in input coordinates; of meshes see `read_colors`.
-        config: settings; the defaults are those of the ``default`` preset.
-        similarity: from input to the geometry's coordinates; the identity if there is none.
-        level: the level of the geometry that the colours belong to.
-        progress: called now and then with how far the training is.
-        started: when the time budget began, by `time.monotonic`; None is now.
+    The geometry f is frozen. The ``cloud`` has colours, in input coordinates (of meshes see `read_colors`), from which
+    ``similarity`` leads to f's. The time budget began when it was ``started``, by `time.monotonic`; None is now. Ctrl-C
+    ends the training early and leaves what has been learnt.
 
     Raises:
         InputError: the cloud has no colours, or lies somewhere else than the surface.
-        ValueError: there is no such level.
-
-    Example:
-        >>> from mplicits.datasets import read_cloud
-        >>> from mplicits.pipelines.fit import fit
-        >>> run = fit("scan.ply")  # doctest: +SKIP
-        >>> fit_texture(run.field, read_cloud("scan.ply"), similarity=run.similarity)  # doctest: +SKIP
+        ValueError: there is no such ``level`` of f.
     """
     config, similarity = config or TextureConfig(), similarity or Similarity.identity()
     budget = Budget(config.time_budget, started=started)

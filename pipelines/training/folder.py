@@ -377,11 +377,8 @@ def resumes_with(run: Path, record: Mapping[str, Any]) -> str | None:
 class RunFolder:
     """What a training writes: its record, a field that is usable at any time, and what it can be resumed from.
 
-    A checkpoint replaces all files at once. An old run stays whole until the first checkpoint of a new one.
-
-    Args:
-        path: the directory; None keeps nothing.
-        resume: whether the interrupted run there is continued.
+    A checkpoint replaces all files at once. An old run stays whole until the first checkpoint of a new one. Without a
+    ``path`` nothing is kept; ``resume`` continues the interrupted run there.
 
     Raises:
         InputError: there is no directory to resume from.

@@ -78,15 +78,8 @@ class Budget:
         """Seconds for the next level: ``seconds`` times its part of the work that is left, ``steps`` times ``cost``.
 
         The finest levels are left out while the levels before them would get less than `fewest_steps`, or than a
-        quarter of their steps. None means that the level is not worth beginning.
-
-        Args:
-            seconds: for all levels from ``level`` on.
-            level: the next one.
-            steps: of each level.
-            cost: measured seconds of a step of a level.
-            training: share of a level's time that is spent on steps.
-            begun: whether the level is under way, and is finished in any case. Level 0 always is.
+        quarter of their steps. None means that the level is not worth beginning; one that has ``begun``, as level 0
+        always has, is finished. ``training`` is the share of a level's time that is spent on steps.
         """
         levels, work = list[int](), list[float]()
         for each in range(level, len(steps)):

@@ -83,11 +83,8 @@ def web_run(
 ) -> WebPage:
     """Write a page that shows a run, a mesh or a cloud and needs nothing else, or a folder for another page.
 
-    Args:
-        source: run directory, .safetensors file, mesh or cloud.
-        out: a file of `PAGES`; any other name is a folder's, see `write_folder`.
-        options: what to show.
-        say: called with a line about what rounding has cost, and what is shown.
+    The name ``out`` is that of a file of `PAGES`, or of a folder, see `write_folder`. ``say`` is called with a line
+    about what rounding has cost, and what is shown.
 
     Raises:
         InputError: see `pack`, or the file cannot be written.

@@ -42,15 +42,7 @@ class Verdict(NamedTuple):
 
 
 class Gate:
-    """The checks of one server, by its address, its port and its token, which is random if it is None.
-
-    Example:
-        >>> gate = Gate("127.0.0.1", 8080, token="secret")
-        >>> gate.admit("/", {"Host": "127.0.0.1:8080"}).status.value
-        403
-        >>> gate.admit("/?token=secret", {"Host": "127.0.0.1:8080"}).headers["Set-Cookie"]
-        'mplicits-8080=secret; Path=/; HttpOnly; SameSite=Strict'
-    """
+    """The checks of one server, by its address, its port and its token, which is random if it is None."""
 
     def __init__(self, host: str, port: int, token: str | None = None) -> None:
         self.host, self.port, self.token = host, port, token or secrets.token_urlsafe(18)

@@ -27,11 +27,8 @@ PORTS = range(8080, 8180)  # the first free one is taken
 class PageServer:
     """Serves what ``pack`` makes until it is closed, as a context manager; only to clients with the token of its `url`.
 
-    Args:
-        pack: makes what the page shows.
-        host: the address to listen on.
-        port: the port, or None for the first free one from 8080 upwards.
-        keep: called with the JSON that the page posts to ``/landmarks``; None refuses it.
+    It listens at the address ``host``, on the ``port`` or on the first free one from 8080 upwards. ``keep`` is called
+    with the JSON that the page posts to ``/landmarks``; None refuses it.
 
     Raises:
         InputError: what ``pack`` raises, or the address or the port cannot be had.

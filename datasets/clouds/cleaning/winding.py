@@ -347,15 +347,6 @@ class DipoleField:
 
     Dipoles ``(N, 3)``, outward normals times areas, at points ``(N, 3)`` within the unit sphere, with softenings ε > 0
     ``(N,)``. Near dipoles are summed one by one, so that the sides of a bar thinner than the leaves do not cancel.
-
-    Example:
-        >>> import numpy as np
-        >>> from mplicits.datasets import sample_sphere
-        >>> sphere = sample_sphere(2000)  # of radius 0.5
-        >>> area = np.pi / 2000
-        >>> field = DipoleField(sphere.points, area * sphere.normals, np.full(2000, 0.01))
-        >>> (field.winding(np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]])) > 0.5).tolist()
-        [True, False]
     """
 
     def __init__(

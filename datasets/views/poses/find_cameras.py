@@ -58,18 +58,11 @@ def find_cameras(
     lens: Literal["auto", "one", "each"] = "auto",
     report: Report | None = None,
 ) -> FoundCameras:
-    """Estimate poses and lenses of photographs by COLMAP's incremental structure from motion.
+    """Estimate poses and lenses of a folder of photographs, or of a film, by COLMAP's incremental mapping.
 
     The project gets ``images`` (links to the photographs, or frames of the film) and ``sparse/0``. The same call
     continues an interrupted project, and returns the result of a finished one at once. Of a film the sharpest frame is
-    taken from each of ``frames`` stretches of equal length.
-
-    Args:
-        source: a folder of photographs, or a film.
-        project: the folder to be written.
-        frames: number of frames of a film.
-        lens: whether the photographs share one lens; auto: if they have one size.
-        report: progress of the stages.
+    taken from each of ``frames`` stretches of equal length. With the ``lens`` "auto" photographs of one size share one.
 
     Raises:
         InputError: nothing can be read, the project is of something else, or too few photographs overlap.

@@ -46,17 +46,12 @@ class FoundPoints:
 
 
 def find_points(source: str | Path, project: str | Path, *, report: Report | None = None) -> FoundPoints:
-    """Triangulate sparse points from photographs with fixed cameras.
+    """Triangulate sparse points from photographs with fixed cameras, as `read_posed_images` takes them.
 
     The project is a COLMAP model in the same world coordinates: photographs without lens distortion, masks as
     transparency, depth maps, the given cameras, and points with their observations. Each photograph is matched with the
     twenty whose directions from the region are nearest. The same call continues an interrupted project, and returns the
     result of a finished one at once.
-
-    Args:
-        source: posed photographs, as `read_posed_images` takes them.
-        project: the folder to be written.
-        report: progress of the stages.
 
     Raises:
         InputError: the photographs cannot be read, the project is of something else, or no two photographs match.
