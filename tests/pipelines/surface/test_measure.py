@@ -256,5 +256,5 @@ def test_what_no_photograph_sees_does_not_count():
     # Samples of half a square are twice as dense as those of a whole one, so both are within two of its floors.
     assert metrics.visible.chamfer < 2 * metrics.chamfer_floor
     assert "chamfer where 2 photographs see" in measure.format_metrics(metrics)
-    with pytest.raises(ValueError, match="give a mesh"):
+    with pytest.raises(ValueError, match="view_counts"):
         evaluate_surfaces(truth, Mesh(truth.vertices, truth.faces[:0]), samples=10, view_counts=view_counts)
