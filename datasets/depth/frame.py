@@ -108,7 +108,8 @@ def read_frame(
 def read_poses(path: str | Path) -> list[PosedFrame]:
     """Read the poses of frames, camera to world in OpenCV's axes, in the order of the file.
 
-    - text: Open3D's ``trajectory.log``; TUM's ``timestamp tx ty tz qx qy qz qw``; KITTI's rows of 3 × 4 matrices.
+    - text: Open3D's ``trajectory.log``; TUM's ``timestamp tx ty tz qx qy qz qw`` (``qw`` first, if a comment says so);
+      KITTI's rows of 3 × 4 matrices.
     - a folder with a 4 × 4 (or 3 × 4) matrix for each frame (ScanNet, 7-Scenes), or with Polycam's cameras in JSON.
     - JSON: ``transforms.json``, which also brings names and lenses; Open3D's camera trajectories and parameters;
       Record3D's ``metadata``.

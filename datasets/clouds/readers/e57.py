@@ -58,10 +58,8 @@ def _scan(image: Any, header: Any) -> dict[str, Float64]:
 
     count = int(header.point_count)
     read = {name: np.empty(count) for name in header.point_fields if _READ.fullmatch(name)}
-    buffers = libe57.VectorSourceDestBuffer()
-    for name, values in read.items():
-        buffers.append(libe57.SourceDestBuffer(image, name, values, count, True, True))
-    header.points.reader(buffers).read()
+    buffers = [libe57.SourceDestBuffer(image, name, values, count, True, True) for name, values in read.items()]
+    header.points.reader(libe57.VectorSourceDestBuffer(buffers)).read()
     pose = {}
     for part, axes in (("rotation", "xyzw"), ("translation", "xyz")):
         there = header.node.isDefined(f"pose/{part}")

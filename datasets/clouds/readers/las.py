@@ -48,7 +48,7 @@ class LasStream(CloudStream):
 
 
 def read_las(path: Path, columns: str | None = None, *, drop_noise: bool = False) -> PointCloud:
-    """The points but for withheld ones, with colours and normals where the file has them; see `LasStream`."""
+    """The points but for withheld ones, with colours and normals if there are any; noise goes with `--drop-noise`."""
     laspy, choice = _laspy(path, columns), _Choice(path, drop_noise)
     with _reading(path):
         las = laspy.read(path)

@@ -30,8 +30,10 @@ def read_stl(path: Path) -> tuple[PointCloud, Int64]:
         facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
         corners = np.frombuffer(data, facet, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
     elif re.match(r"\s*solid\b", text := decoded(data), re.IGNORECASE):
-        text = re.sub(r"^[ \t]*(end)?solid\b[^\n]*", "", text, flags=re.MULTILINE | re.IGNORECASE)  # may name anything
-        found = re.findall(r"\bvertex\s+(\S+[ \t]+\S+[ \t]+\S+)", text, re.IGNORECASE)
+        found = re.findall(r"^\s*vertex\s+([^\n]*)", text, re.MULTILINE | re.IGNORECASE)
+        if not found:  # facets on one line; after the name of the solid, which may be anything
+            text = re.sub(r"^[ \t]*(end)?solid\b[^\n]*", "", text, flags=re.MULTILINE | re.IGNORECASE)
+            found = re.findall(r"\bvertex\s+(\S+[ \t]+\S+[ \t]+\S+)", text, re.IGNORECASE)
         corners = numbers("\n".join(found), path, first_line=1, what="vertex") if found else np.empty((0, 3))
     else:
         raise InputError(f"{path}: not a readable STL file; check its extension or export it again")

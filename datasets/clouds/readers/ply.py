@@ -98,8 +98,8 @@ def _read(path: Path, columns: str | None, *, meshes: bool) -> tuple[PointCloud,
 
 def _has_faces(element: _Element) -> bool:
     """Whether rows are faces: by the usual names of the element, or of a list in it."""
-    names = {p.name.lower() for p in element.properties if p.length_kind}
-    return element.name in ("face", "tristrips") or not names.isdisjoint(_INDICES)
+    lists = (p.name.lower() for p in element.properties if p.length_kind)
+    return element.name in ("face", "tristrips") or any(name in _INDICES for name in lists)
 
 
 def _faces(

@@ -23,7 +23,7 @@ def read_text(path: Path, columns: str | None = None) -> PointCloud:
 
     A line before the numbers may name the columns (see `choose_layout`). The counts of points in PTS files are skipped.
     """
-    text = re.sub(r'"([-+]?[.,]?\d[-+.,\deE]*)"', r"\1", decoded(path.read_bytes()))  # quoted numbers
+    text = re.sub(r'"([-+]?[.,]?\d[-+.,\deE]*)"', r"\1", decoded(path.read_bytes()))  # numbers may be quoted
     if "\0" in text:
         raise InputError(f"{path}: holds binary data, not text; check its extension")
     lines = text.split("\n")
@@ -40,8 +40,8 @@ def read_text(path: Path, columns: str | None = None) -> PointCloud:
     if not first:
         raise InputError(f"{path}: no numbers in it; export it again")
     separator, decimal = _dialect(first)
-    body = "\n".join(lines[skipped:])
-    if (s := separator) in (",", ";") and any(m in f"\n{body}\n" for m in (s + s, f"{s} {s}", f"\n{s}", f"{s}\n")):
+    body = "\n".join([*lines[skipped:], ""])
+    if (s := separator) in (",", ";") and any(mark in body for mark in (s + s, f"{s} {s}", f"\n{s}", f"{s}\n")):
         body = re.sub(rf"^ *(?={s})|(?<={s}) *(?={s}|$)", "nan", body, flags=re.MULTILINE)  # empty fields
     if count:
         body = re.sub(r"^[ \t]*\d+[ \t]*$", "", body, flags=re.MULTILINE)
@@ -165,9 +165,9 @@ _ARRAYS = {
 
 
 def read_npz(path: Path, columns: str | None = None) -> PointCloud:
-    """``points`` (N, 3), ``normals`` (float, or int8/int16 over their largest value) and ``colors``.
+    """``points`` (N, 3), ``normals`` and ``colors``, or other usual names; or an array for each column (``x``).
 
-    Other usual names (``xyz``, ``rgb``), and arrays for single columns (``x``, ``nx``, ``red``), are known too.
+    Normals are float, or int8 or int16 over their largest value.
     """
 
     def known(name: str) -> tuple[str, ...] | None:
