@@ -215,9 +215,10 @@ class OfficialBench(Benchmark[OfficialRow]):
         ]
         items = [(f"{row.shape}{' + noise' * row.noisy}", row) for row in rows]
         each = tabulated("official_shapes", "Each shape", "shape", figures, items)
-        groups = {key: _Group([], figures) for key, figures in VERIFIED.items()}
+        keys = [*((row.noisy, row.method) for row in rows), *VERIFIED]
+        groups = {key: _Group([], VERIFIED.get(key)) for key in sorted(dict.fromkeys(keys), key=lambda key: key[0])}
         for row in rows:
-            groups.setdefault((row.noisy, row.method), _Group([], None)).rows.append(row)
+            groups[row.noisy, row.method].rows.append(row)
 
         def over(average: Callable[[Iterable[Any]], float | None], name: str) -> Callable[[_Group], float | None]:
             return lambda group: average(getattr(row, name) for row in group.rows)
@@ -232,7 +233,7 @@ class OfficialBench(Benchmark[OfficialRow]):
             (Column("fit, s", ".0f"), over(mean, "seconds")),
             (Column("mesh, s", ".1f"), over(mean, "mesh_seconds")),
         ]
-        named = [(f"{method}{' + noise' * noisy}", group) for (noisy, method), group in sorted(groups.items())]
+        named = [(f"{method}{' + noise' * noisy}", group) for (noisy, method), group in groups.items()]
         notes = (
             "In brackets: their verification log (2026-09-16, an RTX 5090, 34 to 36 shapes of their archive). Means "
             "over other shapes are no comparison.",
