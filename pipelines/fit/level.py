@@ -163,17 +163,14 @@ class Verdict(NamedTuple):
 
     @property
     def better(self) -> bool:
-        """Whether the level is kept: one error is significantly less and the other not more, or the level `learns`.
+        """Whether the level is kept: one error is significantly less and the loss is less, or the level `learns`.
 
-        An angle to estimated normals never counts against a level. Nor does a distance, if the angle to given normals
-        falls by the larger factor: smoothing has moved the held-out points, and rounded them, but not their normals.
+        The loss weighs distance and angle as the training does. Either may grow where the surface comes nearer: the
+        distance to points that smoothing has rounded off, the angle to normals of vertices, which are means of those of
+        faces. Estimated normals share the noise of the points: with them the distance may not be significantly more.
         """
-        distance, angle = (fall > -JUDGE.surely for fall in self.fall)
-        if self.guessed:
-            angle = True
-        else:
-            distance |= self.after.distance * self.after.angle < self.before.distance * self.before.angle
-        return (max(self.fall) > JUDGE.surely and distance and angle) or self.learns
+        sound = self.fall.distance > -JUDGE.surely if self.guessed else self.after.loss < self.before.loss
+        return (max(self.fall) > JUDGE.surely and sound) or self.learns
 
     @property
     def learns(self) -> bool:
