@@ -53,7 +53,8 @@ class _Key(NamedTuple):
 class DynamicTracer:
     """First intersections of the same rays with a moving surface, frame after frame; see the module.
 
-    Times may come in any order and distance; the nearer, the more frames there are between two key frames.
+    Times may come in any order and distance; the nearer, the more frames there are between two key frames. The
+    ``tolerance``, ``resolution``, ``lipschitz`` and ``radius`` are those of `sphere_trace`.
 
     Args:
         field: four-dimensional.
@@ -61,7 +62,6 @@ class DynamicTracer:
         directions: ``(..., 3)`` of unit length. Rays ``(H, W, 3)`` of an image with one origin are traced in tiles
             first.
         level: whose surface to find.
-        tolerance, resolution, lipschitz, radius: see `sphere_trace`.
         reach: distance that is near; by default 12 resolutions. More makes key frames fewer and other frames dearer;
             with 0 every frame is a key frame.
         speed: bound on |∂f/∂t| near the surface; by default 1.25 times the largest measured around it at every key
