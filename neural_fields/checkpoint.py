@@ -127,7 +127,7 @@ def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cp
     with _reading(path, _FIELD, device) as (header, tensors):
         field = _build(header["field"], tensors)
         _restore(path, field, tensors, "fit the field again")
-        similarity = _similarity(header["similarity"])
+        similarity = similarity_of(header["similarity"])
         return SavedField(field.to(device).requires_grad_(False), similarity, header["metadata"])
 
 
@@ -355,7 +355,8 @@ def _describe(field: Field) -> dict[str, Any]:
     )
 
 
-def _similarity(described: Mapping[str, Any]) -> Similarity:
+def similarity_of(described: Mapping[str, Any]) -> Similarity:
+    """The similarity that a file describes by ``center`` and ``scale``; ValueError if they are no such numbers."""
     x, y, z = (float(number) for number in described["center"])
     scale = float(described["scale"])
     if not (all(map(math.isfinite, (x, y, z))) and 0 < scale < math.inf):
@@ -396,7 +397,7 @@ def _build(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Fie
         )
     if kind in COMBINED:
         if "similarity" in arguments:
-            arguments["similarity"] = _similarity(arguments["similarity"])
+            arguments["similarity"] = similarity_of(arguments["similarity"])
         parts = [_build(part, tensors) for part in arguments.pop("parts")]
         return COMBINED[kind](*parts, **arguments)
     raise ValueError(f"unknown field type {kind!r}")

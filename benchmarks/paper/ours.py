@@ -16,7 +16,7 @@ from mplicits.pipelines.training.folder import FIELD_FILE
 from mplicits.pipelines.training.settings import FitConfig
 
 from ..harness.jobs import Context, Method, Results
-from ..shapes.fits import has_poisson, kept_fit, screened_poisson
+from ..shapes.fits import has_poisson, kept_fit, screened_poisson, stage_seconds
 from .jobs import PaperJob
 from .judge import Judge, damaged_cloud, fit_config, oriented_cloud, protocol_of
 from .recipe import Recipe
@@ -65,7 +65,7 @@ class Ours(Method[PaperJob]):
         config = dataclasses.replace(our_config(job), device=context.device)
         run = kept_fit(directory, damaged_cloud(job), config, progress=context.progress)
         stages = run.record["stages"]
-        seconds = accumulate(stage["sampling_seconds"] + stage["training_seconds"] for stage in stages)
+        seconds = accumulate(map(stage_seconds, stages))
         parameters = accumulate(stage["parameters"] for stage in stages)
         outputs = [
             judge.field(

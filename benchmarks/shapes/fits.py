@@ -198,9 +198,9 @@ class FitBench(Benchmark[FitRow]):
         run = kept_fit(home, cloud, self.config, progress=progress)
         seconds = 0.0
         for level, stage in enumerate(run.record["stages"]):
-            seconds += stage["sampling_seconds"] + stage["training_seconds"]
+            seconds += stage_seconds(stage)
             mesh, meshing = timed_mesh(run, self.resolution, level)
-            surface = None if mesh is None else _in_input(mesh, run.similarity)
+            surface = None if mesh is None else in_input(mesh, run.similarity)
             yield f"level {level}", seconds, meshing, surface
         if not has_poisson():
             return
@@ -216,7 +216,7 @@ class FitBench(Benchmark[FitRow]):
         for method, oriented, own in rows:
             started = time.perf_counter()
             surface = screened_poisson(oriented, depth=self.poisson_depth, own_normals=own)
-            yield method, time.perf_counter() - started, 0.0, _in_input(surface, oriented.similarity)
+            yield method, time.perf_counter() - started, 0.0, in_input(surface, oriented.similarity)
 
     def tables(self, rows: Sequence[FitRow], *, sgemm: float) -> tuple[Table, ...]:
         """See `Benchmark.tables`."""
@@ -316,7 +316,13 @@ def timed_mesh(run: Run, resolution: int, level: int = -1) -> tuple[Mesh | None,
     return mesh, time.perf_counter() - started
 
 
-def _in_input(surface: Mesh, similarity: Similarity) -> Mesh:
+def stage_seconds(stage: Mapping[str, Any]) -> float:
+    """What a level took, its samples included."""
+    return stage["sampling_seconds"] + stage["training_seconds"]
+
+
+def in_input(surface: Mesh, similarity: Similarity) -> Mesh:
+    """A mesh of the unit sphere in input coordinates."""
     return Mesh(similarity.to_input(surface.vertices), surface.faces, surface.normals, surface.colors)
 
 

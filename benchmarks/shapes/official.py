@@ -1,8 +1,8 @@
 """Benchmark ``official``: the protocol of the paper's own code on its folders, ours beside its checkpoints.
 
-Of ``reproduce.py`` and REPRODUCING.md in dsilvavinicius/m-plicits: the vertices of ``data/normalized_sphere/input`` are
-fitted, or those of ``data/normalized_noise/noise_data``; meshes of 512³; 500,000 samples; squared distances in the
-coordinates of the files; the truth is always the clean mesh.
+It follows ``reproduce.py`` and REPRODUCING.md of dsilvavinicius/m-plicits. The vertices of
+``data/normalized_sphere/input`` are fitted, or those of ``data/normalized_noise/noise_data``. Meshes have 512³ cells;
+500,000 samples give squared distances in the coordinates of the files. The truth is always the clean mesh.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ from typing import Any, NamedTuple
 from mplicits.datasets import add_noise, read_cloud, write_cloud_ply
 from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Similarity
 from mplicits.neural_fields.backend.files import files_in
-from mplicits.pipelines.fit.official import STAGES, read_official
-from mplicits.pipelines.fit.train import Run
+from mplicits.pipelines.fit.official import import_official
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.surface.measure import evaluate_surfaces
 from mplicits.pipelines.surface.surface import read_reference
+from mplicits.pipelines.training.folder import STAGES, WEIGHTS_FILE
+from mplicits.pipelines.training.result import Run
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import parameter_count
 
 from ..harness.benchmark import Benchmark, Part
 from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, mean, median, tabulated
-from .fits import fit_home, kept_fit, timed_mesh
+from .fits import fit_home, in_input, kept_fit, stage_seconds, timed_mesh
 
 INPUTS = Path("data/normalized_sphere/input")
 NOISY = Path("data/normalized_noise/noise_data")
@@ -83,11 +84,11 @@ class OfficialRow:
     delta: float | None
     seconds: float | None
     mesh_seconds: float
-    chamfer: float | None
-    floor: float | None
-    hausdorff: float | None
-    shell_iou: float | None
-    components: int | None
+    chamfer: float | None = None
+    floor: float | None = None
+    hausdorff: float | None = None
+    shell_iou: float | None = None
+    components: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,61 +139,53 @@ class OfficialBench(Benchmark[OfficialRow]):
         files = [truth, cloud]
         if not ours:
             assert self.results is not None
-            files += [file for stage in STAGES if (file := self.results / name / stage / "best.pth").is_file()]
+            files += [file for stage in STAGES if (file := self.results / name / stage / WEIGHTS_FILE).is_file()]
         label = f"{name}{', noisy' * noisy}, {'ours' if ours else 'official'}"
         return Part(self.name, label, tuple(files), (("ours", ours), ("noisy", noisy)))
 
     def measure(self, job: Part, context: Context) -> list[OfficialRow]:
         """See `Benchmark.measure`."""
         (truth, cloud, *checkpoints), about = job.files, job.parameters
-        reference = read_reference(truth)
+        reference, noisy = read_reference(truth), bool(about["noisy"])
         if about["ours"]:
             home = fit_home(context.out, cloud, self.config)
             run = kept_fit(home, read_cloud(cloud), self.config, progress=context.stage(job.name))
-            return self._levels(run, truth.stem, reference, "ours", noisy=bool(about["noisy"]))
-        if len(checkpoints) < 2:
-            read = read_official(checkpoints)
-            return self._levels(Run(read.field, read.similarity, None, {}), truth.stem, reference, "official")
-        read = read_official(checkpoints, cloud=truth)
-        rows = self._levels(Run(read.field, read.similarity, None, {}), truth.stem, reference, "official")
-        fixed = read_official(checkpoints, deltas=FIXED[: len(checkpoints) - 1]).field
-        run = Run(fixed, Similarity.identity(), None, {})
-        return [*rows, self._row(run, len(checkpoints) - 1, truth.stem, reference, FIXED_NAME)]
-
-    def _levels(
-        self, run: Run[MultiscaleSDF], shape: str, reference: Mesh, whose: str, *, noisy: bool = False
-    ) -> list[OfficialRow]:
-        """A row for each level."""
-        rows = []
-        for level in range(run.field.num_levels):
-            name = STAGES[level] if level < len(STAGES) else f"level {level}"
-            rows.append(self._row(run, level, shape, reference, f"{whose} {name}", noisy=noisy))
+        else:
+            run = import_official(checkpoints, cloud=truth)
+        whose = "ours" if about["ours"] else "official"
+        names = [*STAGES, *(f"level {level}" for level in range(len(STAGES), run.field.num_levels))]
+        rows = [
+            self._row(run, level, truth.stem, reference, f"{whose} {names[level]}", noisy)
+            for level in range(run.field.num_levels)
+        ]
+        if len(checkpoints) > 1:
+            fixed = import_official(checkpoints, deltas=FIXED[: len(checkpoints) - 1])
+            rows.append(self._row(fixed, len(checkpoints) - 1, truth.stem, reference, FIXED_NAME, noisy))
         return rows
 
     def _row(
-        self, run: Run[MultiscaleSDF], level: int, shape: str, reference: Mesh, method: str, *, noisy: bool = False
+        self, run: Run[MultiscaleSDF], level: int, shape: str, reference: Mesh, method: str, noisy: bool
     ) -> OfficialRow:
         mesh, mesh_seconds = timed_mesh(run, self.resolution, level)
-        stages = run.record.get("stages", [])[: level + 1]
-        metrics = scale = None
+        figures: dict[str, Any] = {}
         if mesh is not None:
-            moved = Mesh(run.similarity.to_input(mesh.vertices), mesh.faces)
-            metrics = evaluate_surfaces(moved, reference, samples=self.samples, seed=self.config.seed)
-            scale = metrics.scale**2  # to the coordinates of the file, as they measure
-        floor = None if metrics is None else metrics.chamfer_floor
+            surface = in_input(mesh, run.similarity)
+            metrics = evaluate_surfaces(surface, reference, samples=self.samples, seed=self.config.seed)
+            assert metrics.chamfer_floor is not None
+            unit = metrics.scale**2  # to the coordinates of the file, as they measure
+            figures = {"chamfer": metrics.chamfer * unit, "floor": metrics.chamfer_floor * unit}
+            figures |= {"hausdorff": metrics.hausdorff * unit}
+            figures |= {"shell_iou": metrics.shell_iou, "components": metrics.components}
+        seconds = [stage_seconds(stage) for stage in run.record["stages"][: level + 1] if "training_seconds" in stage]
         return OfficialRow(
             shape=shape,
             noisy=noisy,
             method=method,
             parameters=parameter_count(*run.field.levels[: level + 1]),
             delta=float(run.field.deltas[level - 1]) if level else None,
-            seconds=sum(s["sampling_seconds"] + s["training_seconds"] for s in stages) if stages else None,
+            seconds=sum(seconds) if seconds else None,
             mesh_seconds=mesh_seconds,
-            chamfer=None if metrics is None or scale is None else metrics.chamfer * scale,
-            floor=None if floor is None or scale is None else floor * scale,
-            hausdorff=None if metrics is None or scale is None else metrics.hausdorff * scale,
-            shell_iou=None if metrics is None else metrics.shell_iou,
-            components=None if metrics is None else metrics.components,
+            **figures,
         )
 
     def tables(self, rows: Sequence[OfficialRow], *, sgemm: float) -> tuple[Table, ...]:

@@ -29,7 +29,7 @@ from scipy.spatial import KDTree
 from ..harness.benchmark import Benchmark, Part
 from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Row, Table, tabulated
-from .fits import fit_home, has_poisson, kept_fit, screened_poisson, timed_mesh
+from .fits import fit_home, has_poisson, in_input, kept_fit, screened_poisson, stage_seconds, timed_mesh
 from .sampled_error import approximation_error, near_surface
 
 Float64 = NDArray[np.float64]
@@ -273,12 +273,12 @@ class SrbBench(Benchmark[SrbRow]):
         run = kept_fit(home, cloud, config, progress=context.stage(home.name))
         seconds = 0.0
         for level, stage in enumerate(run.record["stages"]):
-            seconds += stage["sampling_seconds"] + stage["training_seconds"]
+            seconds += stage_seconds(stage)
             mesh, _ = timed_mesh(run, self.resolution, level)
             yield (
                 f"level {level}",
                 seconds,
-                None if mesh is None else _in_input(mesh, run.similarity),
+                None if mesh is None else in_input(mesh, run.similarity),
                 judge.sdf_error(run.field, run.similarity, level),
             )
         if has_poisson():
@@ -288,7 +288,7 @@ class SrbBench(Benchmark[SrbRow]):
             yield (
                 "screened Poisson",
                 time.perf_counter() - started,
-                _in_input(surface, oriented.similarity),
+                in_input(surface, oriented.similarity),
                 None,
             )
 
@@ -335,10 +335,6 @@ class SrbBench(Benchmark[SrbRow]):
         ]
         published = Table(f"{self.name}_published", "What papers print, raw units", "method", columns, tuple(printed))
         return ours, published
-
-
-def _in_input(surface: Mesh, similarity: Similarity) -> Mesh:
-    return Mesh(similarity.to_input(surface.vertices), surface.faces)
 
 
 class _Judge:

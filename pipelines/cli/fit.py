@@ -260,7 +260,7 @@ def _describe_field(path: Path) -> Rows:
         stage = stages.get(index, {})
         rows.append((f"level {index}", _describe_level(level, stage)))
         judged = stage.get("held_out")
-        if judged and stage["silenced"] == (judged["after"] >= judged["before"]):
+        if judged and stage["silenced"] != judged.get("kept", not stage["silenced"]):
             rows.append(("  held out", judged["verdict"]))
         elif stage.get("silenced"):
             rows.append(("  held out", f"level {index} set to zero: further from the points than the level before it"))

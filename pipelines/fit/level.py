@@ -189,6 +189,7 @@ class Verdict(NamedTuple):
         pairs = zip(before, after, self.fall, (scale, 1.0), strict=True)
         distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}{{}} ({_sure(fall)})" for b, a, fall, unit in pairs)
         errors = f"mean distance {distance.format('')}, mean angle of the normals {angle.format('°')}"
+        errors += f", loss {self.before.loss:.3g} → {self.after.loss:.3g}"
         if self.learns and max(self.fall) <= JUDGE.surely:
             errors += f"; at the points it was trained on the root mean square is {self.learnt:.2f} of what it was"
         return f"level {level} {judged}: without it → with it, at {self.points:,} points held out: {errors}"
@@ -204,6 +205,7 @@ class Verdict(NamedTuple):
             "angle": [error.angle for error in (self.before, self.after)],
             "fall_in_standard_errors": self.fall._asdict(),
             "learnt": self.learnt,
+            "kept": self.better,
             "verdict": self.words(level, scale=scale),
         }
 
@@ -232,7 +234,7 @@ class Judge:
 
     They are means over the surface, by ``areas`` ``(n,)``, of the points in the band of half-width ``delta`` around
     ``previous``. The loss is Eq. 4 without its eikonal term: where a level overfits noise, it rises at held-out points.
-    A level is kept by distances and angles instead, as squares are mostly those of few points at sharp edges.
+    A level is kept if it falls, and distances or angles significantly: squares are mostly those of few points at edges.
     """
 
     def __init__(

@@ -6,6 +6,7 @@ it is 1 outside of them.
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import math
@@ -19,17 +20,16 @@ from torch import Tensor
 from ...datasets import read_cloud
 from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren, load_field
 from ...neural_fields.backend.files import damage, json_bytes, write_whole
+from ...neural_fields.checkpoint import similarity_of
 from ...neural_fields.networks.encoded import EncodedField
 from ...neural_fields.networks.multiscale import levels_of
 from ..surface.surface import thinned
-from ..training.folder import SUPPORT_FILE, RunFolder, find_field, named_cloud
+from ..training.folder import STAGES, SUPPORT_FILE, WEIGHTS_FILE, RunFolder, find_field, named_cloud
 from ..training.result import Run
 from ..training.settings import FitConfig
 from ..training.trainer import parameter_count
 from .samples import delta_of
 
-STAGES = ("coarse", "medium", "fine")  # their names of the levels, and of the folders
-WEIGHTS_FILE = "best.pth"
 FRAME_FILE = "frame.json"  # what their format has no place for: bands, taper, input coordinates
 FIXED_BAND = 0.1  # half-width of their fixed coarse band (`reconstruct.py`), in units of the sphere: the widest
 
@@ -46,12 +46,14 @@ class Official(NamedTuple):
     """A model that was read.
 
     Attributes:
+        files: of the levels, coarse to fine.
         field: its levels, in unit-sphere coordinates.
         similarity: from input coordinates; the identity unless the folder has one.
         points: of the cloud that gave the bands, ``(N, 3)`` in those coordinates; None without one.
         inside_out: whether level 0 is negative at most corners of the cube [−1, 1]³.
     """
 
+    files: Sequence[Path]
     field: MultiscaleSDF
     similarity: Similarity
     points: Tensor | None
@@ -172,7 +174,7 @@ def read_official(
         field = field.with_level(level, delta=delta)
     field.taper = frame.taper
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
-    return Official(field, frame.similarity, points, bool(levels[0].value(corners).median() < 0))
+    return Official(files, field, frame.similarity, points, bool(levels[0].value(corners).median() < 0))
 
 
 def _files_of(paths: str | Path | Sequence[str | Path]) -> tuple[list[Path], _Frame]:
@@ -191,11 +193,10 @@ def _files_of(paths: str | Path | Sequence[str | Path]) -> tuple[list[Path], _Fr
         return there, _Frame()
     with damage(frame, "remove it, and give --deltas"):
         held = json.loads(frame.read_text(encoding="utf-8"))
-        x, y, z = map(float, held["center"])
-        taper, similarity = float(held["taper"]), Similarity((x, y, z), float(held["scale"]))
+        taper = float(held["taper"])
         if not 0 <= taper <= 1:
             raise ValueError(f"taper {taper:g}")
-        return there, _Frame([float(width) for width in held["deltas"]], taper, similarity)
+        return there, _Frame([float(width) for width in held["deltas"]], taper, similarity_of(held))
 
 
 def _check_on_surface(cloud: str, field: Field, points: Tensor) -> None:
@@ -217,29 +218,26 @@ def import_official(
     paths: str | Path | Sequence[str | Path], out: str | Path | None = None, **options: Any
 ) -> Run[MultiscaleSDF]:
     """`read_official`, with its ``options``, into a run directory that all commands take; None writes nothing."""
-    field, similarity, points, inside_out = read_official(paths, **options)
-    folder, stages = RunFolder(out), []
-    for index, level in enumerate(field.levels):
-        stage: dict[str, Any] = {"level": index, "parameters": parameter_count(level), "silenced": False}
-        if points is not None:
-            with torch.no_grad():
-                errors = field.value(points, level=index)
-            stage["rms_at_points"] = float(errors.square().mean().sqrt()) * similarity.scale
-        stages.append(stage)
+    files, field, similarity, points, inside_out = read_official(paths, **options)
+    folder, cloud, stages = RunFolder(out), {}, []
     with folder.writing():
-        cloud = {}
         if points is not None:
             folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy()))
             cloud = named_cloud(str(options["cloud"]), folder.path)
+            with torch.no_grad():
+                values = field.level_values(points)
+            for index, (level, errors) in enumerate(zip(field.levels, values, strict=True)):
+                stage = {"level": index, "parameters": parameter_count(level), "silenced": False}
+                stages.append(stage | {"rms_at_points": float(errors.square().mean().sqrt()) * similarity.scale})
         record = {
             **cloud,
-            "imported": [str(path) for path in _files_of(paths)[0]],
+            "imported": [str(file) for file in files],
             "inside_out": inside_out,
             "finished": True,
-            "similarity": {"center": list(similarity.center), "scale": similarity.scale},
+            "similarity": dataclasses.asdict(similarity),
             "config": {name: str(value) if name == "cloud" else value for name, value in options.items()},
-            "stages": stages if points is not None else [],
-            "parameters": sum(stage["parameters"] for stage in stages),
+            "stages": stages,
+            "parameters": parameter_count(field),
             "deltas": field.deltas.tolist(),
         }
         return Run(field, similarity, folder.out, folder.finish(field, similarity, record))
@@ -248,8 +246,8 @@ def import_official(
 def export_official(run: str | Path, out: str | Path, *, up: str = "y") -> tuple[Path, str]:
     """Write the levels of a run as the paper's code and its renderer read them.
 
-    The folder gets ``coarse/best.pth`` and so on, ω₀ folded in, the renderer's weights and biases as flat float32, and
-    a JSON file with the bands and the input coordinates, by which `read_official` gives the field back, bit for bit.
+    The folder gets ``coarse/best.pth`` and so on, ω₀ folded in, and the renderer's weights and biases as flat float32.
+    By a JSON file with the bands and the input coordinates, `read_official` gives the field back, bit for bit.
 
     Args:
         run: run directory or .safetensors file.
@@ -289,8 +287,8 @@ def export_official(run: str | Path, out: str | Path, *, up: str = "y") -> tuple
     lines += ["textures_layers = 0", "is3d = 1", "surface_w0 = 1", "textures_w0 = 0"]
     lines += [f"swap_y_and_z = {int(up == 'z')}", "invert_z = 0", "flip_y = 1"]  # as for their y-up and z-up shapes
     taper = field.taper if isinstance(field, MultiscaleSDF) else 0.0
-    about = {"deltas": field.deltas.tolist(), "taper": taper, "center": list(similarity.center)}
-    write_whole(out / FRAME_FILE, json_bytes({**about, "scale": similarity.scale}))
+    about = {"deltas": field.deltas.tolist(), "taper": taper, **dataclasses.asdict(similarity)}
+    write_whole(out / FRAME_FILE, json_bytes(about))
     write_whole(out / f"{out.name}.exp", "\n".join(lines) + "\n")
     steps = ["20", *["5"] * (len(levels) - 1), "0", "0"][: len(STAGES)]
     delta = f" -delta={float(field.deltas[0]):.4g}" if len(levels) > 1 else ""

@@ -44,6 +44,8 @@ SUPPORT_FILE = "support.safetensors"
 VELOCITY_FILE = "velocity.safetensors"
 CLOUD_FILE = "cloud.ply"  # what was made of depth maps
 MERGED_FILE = "merged_cloud.npz"  # of a large cloud, made again where it is missing
+STAGES = ("coarse", "medium", "fine")  # folders of a model of the paper's code: its levels
+WEIGHTS_FILE = "best.pth"  # in each of them
 JOURNAL = ".journal"
 PARTIAL = re.compile(r"\..*\.(\d+)\.partial(\.[^.]*)?")  # of `whole_file`
 # What a resumed run may do otherwise than it began; all else would make another run of it.
@@ -219,7 +221,7 @@ def is_field(path: str | Path) -> bool:
 def is_official(path: str | Path) -> bool:
     """Whether ``path`` is a model as the paper's own code writes it, a .pth file or a folder of them, and no run."""
     path = Path(path)
-    return path.suffix.lower() in (".pth", ".pt") or (path / "coarse" / "best.pth").is_file()
+    return path.suffix.lower() in (".pth", ".pt") or (path / STAGES[0] / WEIGHTS_FILE).is_file()
 
 
 def load_still(path: str | Path, time: float | None = None, *, device: torch.device | str = "cpu") -> SavedField:

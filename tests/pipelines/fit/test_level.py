@@ -210,11 +210,17 @@ def test_a_level_is_kept_if_it_is_surely_better() -> None:
 def test_a_verdict_in_words_and_numbers() -> None:
     verdict = verdict_of(3.0, 0.0, 0.5)
     words = verdict.words(2, scale=10.0)
-    for part in ("level 2", "50%", "0.1 → 0.02 (significantly less)", "3 → 1.5° (no significant difference)"):
+    for part in (
+        "level 2",
+        "loss 2 → 1",
+        "50%",
+        "0.1 → 0.02 (significantly less)",
+        "3 → 1.5° (no significant difference)",
+    ):
         assert part in words
     assert "0.70" in verdict_of(1.5, 1.5)._replace(learnt=0.7).words(1)
     record = verdict.record(1, scale=10.0)
-    assert (record["before"], record["after"]) == (2, 1)
+    assert (record["before"], record["after"], record["kept"]) == (2, 1, True)
     assert (record["distance"], record["angle"]) == ([0.1, 0.02], [3.0, 1.5])
     assert record["fall_in_standard_errors"] == {"distance": 3.0, "angle": 0.0}
 

@@ -250,7 +250,7 @@ def test_npz(tmp_path):
     ):
         np.savez(path, **arrays)
         read = check(path, expected)
-        assert ("scan" in read.reading) == ("scan" in arrays)  # what is not read is said
+        assert ("scan" in read.reading) == ("scan" in arrays)  # an array that is ignored is named
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
