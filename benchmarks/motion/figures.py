@@ -237,14 +237,14 @@ def _arm(x: Tensor) -> Tensor:
     whole = solids.smooth_union(upper, lower, 0.05)
     for part in (hand, thumb, bump):
         whole = solids.smooth_union(whole, part, 0.04)
-    return whole.value.reshape(x.shape[:-1])
+    return whole.reshape(x.shape[:-1])
 
 
 def _bar(x: Tensor) -> Tensor:
     p = x.reshape(-1, 3)
     bar = solids.rounded_box(p, (0.0, 0.0, 0.0), (0.12, 0.24, 0.7), 0.06)
     knob = solids.ellipsoid(p, (0.0, 0.24, 0.5), (0.09, 0.12, 0.09))
-    return solids.smooth_union(bar, knob, 0.04).value.reshape(x.shape[:-1])
+    return solids.smooth_union(bar, knob, 0.04).reshape(x.shape[:-1])
 
 
 def straightened(x: Tensor, z: Tensor, kappa: Tensor, half: float) -> tuple[Tensor, Tensor]:

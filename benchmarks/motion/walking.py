@@ -197,7 +197,7 @@ def _body(x: Tensor) -> Tensor:
         parts.append(solids.round_cone(p, (0.0, y, -0.8), (0.14, y, -0.82), 0.05, 0.04))
     for part in parts:
         whole = solids.smooth_union(whole, part, 0.03)
-    return whole.value.reshape(x.shape[:-1])
+    return whole.reshape(x.shape[:-1])
 
 
 def _weight(x: Tensor) -> Tensor:
