@@ -63,6 +63,30 @@ class SequenceOptions:
         return (even**2 * (3 - 2 * even) if self.ease else even).tolist()
 
 
+@dataclass(frozen=True)
+class MovingSurface:
+    """What is written: a surface that moves, its colours, and how."""
+
+    file: Path
+    field: Field  # four-dimensional
+    similarity: Similarity  # from input coordinates to the field's
+    level: int
+    colors: TransportedColors | None
+    options: SequenceOptions
+    progress: Tell | None = None
+
+    def tell(self, done: int) -> None:
+        """Report how many frames are done."""
+        if self.progress is not None:
+            self.progress(done, self.options.frames)
+
+    def colors_of(self, vertices: NDArray[np.floating], time: float) -> NDArray[np.floating] | None:
+        """Display colours ``(V, 3)`` of points ``(V, 3)`` of the surface at a time; None if it has none."""
+        if self.colors is None:
+            return None
+        return self.colors.at(time)(torch.from_numpy(vertices).to(self.field.like)).cpu().numpy()
+
+
 def check_sequence_path(path: str | Path) -> Path:
     """The path of a sequence, if it can be written there.
 
@@ -99,22 +123,23 @@ def animate_run(
     if field.in_dim != 4:
         raise InputError(f"{file}: does not move; use `mplicits render` or `mplicits mesh`")
     level = chosen_level(field, file, options.level)
-    transported = _transported(file, field, similarity, level, options)
-    if options.shading == "color" and transported is None:
+    colors = _transported(file, field, similarity, level, options)
+    if options.shading == "color" and colors is None:
         raise InputError(f"--shading color: {file} has no texture; name a textured run with --colors RUN")
+    moving = MovingSurface(file, field, similarity, level, colors, options, progress)
     if out.suffix.lower() in ANIMATIONS:
-        frames = film_frames(file, field, transported, level, options, progress)
+        frames = film_frames(moving)
         write_animation(out, there_and_back(frames) if options.loop else frames, fps=options.fps)
         count = max(2 * options.frames - 2, 1) if options.loop else options.frames
         return f"{count} frames of {options.size[0]}×{options.size[1]}"
     if out.suffix.lower() == SHEET:
-        frames = film_frames(file, field, transported, level, options, progress)
+        frames = film_frames(moving)
         moments = [(f"t = {time:.2f}", frame) for time, frame in zip(options.times, frames, strict=True)]
         write_picture(out, contact_sheet(*in_rows(moments, 7)))  # 7 in a row
         return f"{options.frames} moments of {options.size[0]}×{options.size[1]}"
     if out.suffix:
-        return _write_moving_mesh(out, file, field, transported, similarity, level, options, progress)
-    return _write_series(out, file, field, transported, similarity, level, options, progress)
+        return _write_moving_mesh(out, moving)
+    return _write_series(out, moving)
 
 
 def _transported(
@@ -153,22 +178,16 @@ def last_colors(run: str | Path, file: Path, field: Field) -> Colors:
     return lambda points: colors(own(points))
 
 
-def film_frames(
-    file: Path,
-    field: Field,
-    transported: TransportedColors | None,
-    level: int,
-    options: SequenceOptions,
-    progress: Tell | None = None,
-) -> Iterator[Image]:
+def film_frames(moving: MovingSurface) -> Iterator[Image]:
     """The pictures of a film, each traced with what the one before it knew."""
-    camera = orbit_cameras(_outline(file, field, options), options.orbit, size=options.size, frames=1)[0]
+    field, level, options = moving.field, moving.level, moving.options
+    camera = orbit_cameras(_outline(moving), options.orbit, size=options.size, frames=1)[0]
     samples, device = options.samples, field.deltas.device
     strips = [(strip, _tracer(field, strip, level)) for strip in fine_strips(camera, samples)]
     lit = ShadeOptions(shadows=options.shadows, occlusion=options.shadows)
     for index, time in enumerate(options.times, start=1):
         still = moment(field, time)
-        colors = None if transported is None else transported.at(time)
+        colors = None if moving.colors is None else moving.colors.at(time)
         parts = []
         for strip, tracer in strips:
             directions = strip.rays(device=device)[1]
@@ -178,8 +197,7 @@ def film_frames(
             if len(seen.pixel):
                 rgb = shade(seen, options.shading, camera=strip, field=still, level=level, options=lit)
             parts.append(downsample(compose(seen, rgb, background=(1.0, 1.0, 1.0)), samples))
-        if progress is not None:
-            progress(index, options.frames)
+        moving.tell(index)
         yield np.concatenate(parts)
 
 
@@ -205,79 +223,55 @@ def _tracer(field: Field, camera: Camera, level: int) -> DynamicTracer:
     )
 
 
-def _outline(file: Path, field: Field, options: SequenceOptions) -> NDArray[np.float64]:
+def _outline(moving: MovingSurface) -> NDArray[np.float64]:
     """Points that the camera has to have in view at all times."""
     seen = []
-    for time in np.linspace(0, 1, min(9, options.frames)).tolist():
+    for time in np.linspace(0, 1, min(9, moving.options.frames)).tolist():
         try:
-            seen.append(extract_mesh(moment(field, time), resolution=48, normals=False).vertices)
+            seen.append(extract_mesh(moment(moving.field, time), resolution=48, normals=False).vertices)
         except NoSurfaceError:
             continue  # a surface may come and go
     if not seen:
-        raise InputError(f"{file}: no surface at any time")
+        raise InputError(f"{moving.file}: no surface at any time")
     return traced_part(np.concatenate(seen))
 
 
-def _write_series(
-    folder: Path,
-    file: Path,
-    field: Field,
-    transported: TransportedColors | None,
-    similarity: Similarity,
-    level: int,
-    options: SequenceOptions,
-    progress: Tell | None,
-) -> str:
+def _write_series(folder: Path, moving: MovingSurface) -> str:
     """frame_0000.ply and so on; a frame without a surface has no file."""
+    field, options = moving.field, moving.options
     folder.mkdir(parents=True, exist_ok=True)
     digits = max(4, len(str(options.frames - 1)))
     written = 0
     for index, time in enumerate(options.times):
         try:
-            mesh = extract_mesh(moment(field, time), resolution=options.resolution, level=level)
+            mesh = extract_mesh(moment(field, time), resolution=options.resolution, level=moving.level)
         except NoSurfaceError:
             continue
-        if transported is not None:
-            points = torch.from_numpy(mesh.vertices).to(field.like)
-            mesh = dataclasses.replace(mesh, colors=transported.at(time)(points).cpu().numpy())
-        write_mesh(folder / f"frame_{index:0{digits}d}.ply", mesh, similarity)
+        mesh = dataclasses.replace(mesh, colors=moving.colors_of(mesh.vertices, time))
+        write_mesh(folder / f"frame_{index:0{digits}d}.ply", mesh, moving.similarity)
         written += 1
-        if progress is not None:
-            progress(index + 1, options.frames)
+        moving.tell(index + 1)
     if not written:
         folder.rmdir()
-        raise InputError(f"{file}: no surface at any time")
+        raise InputError(f"{moving.file}: no surface at any time")
     missing = options.frames - written
     return f"{written} meshes" + (f"; {missing} frames have no surface" if missing else "")
 
 
-def _write_moving_mesh(
-    out: Path,
-    file: Path,
-    field: Field,
-    transported: TransportedColors | None,
-    similarity: Similarity,
-    level: int,
-    options: SequenceOptions,
-    progress: Tell | None,
-) -> str:
+def _write_moving_mesh(out: Path, moving: MovingSurface) -> str:
+    options = moving.options
     if options.frames < 2:
         raise InputError(f"--frames {options.frames}: a mesh moves in 2 frames or more")
-    tracked = follow_mesh(
-        field, options.times, resolution=options.resolution, level=level, name=str(file), progress=progress
-    )
-    colors = None
-    if transported is not None:
-        points = torch.from_numpy(tracked.vertices[0]).to(field.like)
-        colors = transported.at(0.0)(points).cpu().numpy()
+    about = {"resolution": options.resolution, "level": moving.level}
+    tracked = follow_mesh(moving.field, options.times, name=str(moving.file), progress=moving.progress, **about)
     write_moving(
         out,
         tracked.faces,
         list(tracked.vertices),
         list(tracked.normals),
         seconds=np.arange(options.frames) / options.fps,
-        similarity=similarity,
-        colors=colors,
+        similarity=moving.similarity,
+        colors=moving.colors_of(tracked.vertices[0], 0.0),
         placement=Placement(options.orbit.up),
     )
     size = math.ceil(out.stat().st_size / 1e6)

@@ -36,7 +36,7 @@ from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from mplicits.neural_fields.tracing.sphere import project_to_surface
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve import animate
-from mplicits.pipelines.evolve.animate import SequenceOptions, animate_run, film_frames
+from mplicits.pipelines.evolve.animate import MovingSurface, SequenceOptions, animate_run, film_frames
 from mplicits.pipelines.evolve.follow import follow_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.render.draw import Orbit, RenderOptions, render_run
@@ -128,7 +128,7 @@ def test_a_mesh_of_a_moment_is_where_the_surface_is_then(run, tmp_path, time):
 
 def test_every_frame_of_a_film_is_what_tracing_it_alone_shows(run):
     options = SequenceOptions(frames=4, size=(40, 32), samples=1, shading="normals")
-    frames = list(film_frames(run, moving_field(run), None, 0, options))
+    frames = list(film_frames(MovingSurface(run, moving_field(run), PLACE, 0, None, options)))
     assert {frame.shape for frame in frames} == {(32, 40, 3)}
     balls = [(frame < 255).any(axis=2) for frame in frames]
     steps = np.diff([np.nonzero(ball)[1].mean() for ball in balls])
@@ -152,7 +152,7 @@ def test_a_sheet_has_all_frames_with_their_times(run, tmp_path):
     assert animate_run(run, tmp_path / "ball.png", options) == "8 moments of 32×24"
     sheet = iio.imread(tmp_path / "ball.png")
     assert sheet.shape == (2 * (24 + 40), 7 * (32 + 12), 3)
-    frames = list(film_frames(run, moving_field(run), None, 0, options))
+    frames = list(film_frames(MovingSurface(run, moving_field(run), PLACE, 0, None, options)))
     np.testing.assert_array_equal(sheet[40:64, 6:38], frames[0])
     np.testing.assert_array_equal(sheet[104:128, 6:38], frames[7])
     assert (sheet[64:, 44:] == 255).all()
