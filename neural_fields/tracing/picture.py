@@ -23,7 +23,7 @@ from ..backend.kernels.cones import march_cones
 from ..backend.kernels.launch import on_device
 from ..backend.kernels.levels import Levels, walk_rows
 from ..backend.kernels.paths import march_fused
-from ..backend.kernels.tracing import Marched, Queue, RayTensors
+from ..backend.kernels.tracing import March, Marched, Queue, RayTensors
 from ..fields.field import Field
 from .cones import TILES
 
@@ -316,10 +316,8 @@ class Picture:
                 free, entries, ends, starts, *self.queue, self.marched.mask, width, count,
                 SIDE=larger, PIXELS=PROGRAM_PIXELS,
             )  # fmt: skip
-            march_fused(
-                self.traced, self.rays, self.queue, self.marched, view[16:19],
-                max_steps=setting.max_steps, constants=dict(setting.march),
-            )  # fmt: skip
+            numbers, constants = view[16:19], dict(setting.march)
+            march_fused(March(self.traced, self.rays, self.queue, self.marched, numbers, setting.max_steps, constants))
             count_hits[grid](self.marched.mask, self.counts, count, PIXELS=PROGRAM_PIXELS)
             place_hits[grid](
                 origins, directions, self.marched.mask, self.marched.depth, self.counts, self.hits, *self.drawn[:3],

@@ -124,7 +124,12 @@ def sphere_trace(
         )  # fmt: skip
     else:
         check_rays(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
-        hits = _trace_budget(field, origins, directions, budget, level, near, far, tolerance, radius, capture)
+        _check_budget(field, level, budget)
+        with torch.no_grad():
+            units, length = unit_directions(directions)
+            spans, marched = _begin(origins, units, length, near, far, radius)
+            march_budget(field, Rays.begin(*spans), marched, budget, tolerance, capture)
+            hits = _hits(marched, origins, units, length)
     return _on_graph(field, origins, directions, level, hits) if differentiable else hits
 
 
@@ -141,29 +146,12 @@ def _on_graph(field: Field, origins: Tensor, directions: Tensor, level: int, hit
     return hits._replace(depth=depth, position=origins + depth[..., None] * directions)
 
 
-@torch.no_grad()
-def _trace_budget(
-    field: Field,
-    origins: Tensor,
-    directions: Tensor,
-    budget: Sequence[int],
-    level: int,
-    near: Tensor | float,
-    far: Tensor | float,
-    tolerance: float,
-    radius: float | None,
-    capture: float,
-) -> Hits:
-    """The paper's mode of `sphere_trace`."""
+def _check_budget(field: Field, level: int, budget: Sequence[int]) -> None:
     level = field.resolve_level(level)
     if len(budget) != level + 1:
         raise ValueError(f"budget={list(budget)}: expected {level + 1} number(s) of steps, one for each level")
     if bool((field.deltas[:level].isinf().cpu() & (torch.tensor(budget[:level]) > 0)).any()):
         raise ValueError(f"budget={list(budget)}: a level without a band leads to no other; give it 0 steps")
-    directions, length = unit_directions(directions)
-    spans, hits = _begin(origins, directions, length, near, far, radius)
-    march_budget(field, Rays.begin(*spans), hits, budget, tolerance, capture)
-    return _hits(hits, origins, directions, length)
 
 
 @torch.no_grad()
@@ -229,7 +217,7 @@ def march_constants(dtype: torch.dtype) -> dict[str, float]:
 def _march_fused(field: Field, level: int, spans: Sequence[Tensor], hits: RayHits, rule: Rule, max_steps: int) -> None:
     """`march` by the fused kernels, with the same bounds, but for the last bits."""
     from ..backend.kernels.paths import march_fused
-    from ..backend.kernels.tracing import Marched, Queue, RayTensors
+    from ..backend.kernels.tracing import March, Marched, Queue, RayTensors
 
     origins, directions, entries, starts, ends = (column.contiguous() for column in spans)
     if not len(starts):
@@ -238,7 +226,7 @@ def _march_fused(field: Field, level: int, spans: Sequence[Tensor], hits: RayHit
     marched, queue = Marched.nothing(hits.depth), Queue.of(starts, ends)
     numbers = starts.new_tensor([rule.tolerance, rule.resolution, rule.lipschitz])
     rays = RayTensors(origins, directions, starts, entries, ends)
-    march_fused(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=march_constants(starts.dtype))
+    march_fused(March(levels, rays, queue, marched, numbers, max_steps, march_constants(starts.dtype)))
     hits.mask, hits.depth, hits.steps, hits.slope, hits.level = marched.in_own_types()
 
 

@@ -16,13 +16,12 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
 from . import tracing
 from .launch import half_scratch, launch
-from .levels import Levels, gate_of, level_of_tile
+from .levels import gate_of, level_of_tile
 from .tensor_tiles import keep
-from .tracing import Marched, Queue, RayTensors, advance, first_band, turned_back
+from .tracing import March, advance, first_band, turned_back
 
 # Rays under way in a program: more fill the tiles, fewer shorten the end. Twice as many above MANY_RAYS rays in all.
 SLOTS, MANY_RAYS = 256, 1 << 19
@@ -229,33 +228,16 @@ def march_bands(
         running = more | (lengths[LEVELS] < SLOTS)
 
 
-def march_fused(
-    levels: Levels,
-    rays: RayTensors,
-    queue: Queue,
-    marched: Marched,
-    numbers: Tensor,
-    *,
-    max_steps: int,
-    constants: dict[str, float],
-) -> None:
+def march_fused(asked: March) -> None:
     """`march_rays` for one network that leaves registers for rays, `march_levels` for all others."""
-    alone = len(levels.networks) == 1 and levels.networks[0].shape.width <= tracing.IN_REGISTERS
-    march = tracing.march_rays if alone else march_levels
-    march(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=constants)
+    networks = asked.levels.networks
+    alone = len(networks) == 1 and networks[0].shape.width <= tracing.IN_REGISTERS
+    (tracing.march_rays if alone else march_levels)(asked)
 
 
-def march_levels(
-    levels: Levels,
-    rays: RayTensors,
-    queue: Queue,
-    marched: Marched,
-    numbers: Tensor,
-    *,
-    max_steps: int,
-    constants: dict[str, float],
-) -> None:
-    """March the rays of a queue to the surface of the finest of one or more levels; arguments as of `march_rays`."""
+def march_levels(asked: March) -> None:
+    """March the rays of a queue to the surface of the finest of one or more levels."""
+    levels, rays, queue, marched, numbers, max_steps, constants = asked
     kept, like, rows = levels.scratch(jet=False), rays.starts, levels.rows
     # Numbers of a ray: value so far, depth, low, low_value, free, gap, high, high_value, boldness, sign.
     floats = 10

@@ -77,6 +77,18 @@ class Marched(NamedTuple):
         return self._replace(mask=self.mask.bool(), steps=self.steps.long(), level=self.level.long())
 
 
+class March(NamedTuple):
+    """All that a march takes; the state of the queue changes, and results go to ``marched``."""
+
+    levels: Levels
+    rays: RayTensors
+    queue: Queue
+    marched: Marched
+    numbers: Tensor  # (3,) tolerance, resolution and Lipschitz constant of `sphere_trace`, on the device
+    max_steps: int
+    constants: dict[str, float]  # those of `march_constants`
+
+
 @triton.jit
 def first_band(value, deltas, LEVELS: tl.constexpr):
     """How many bands values lie in, and the half-width of the first that they do not, 0 inside all of them."""
@@ -239,21 +251,9 @@ def march(
         running = more | (left < ROWS)
 
 
-def march_rays(
-    levels: Levels,
-    rays: RayTensors,
-    queue: Queue,
-    marched: Marched,
-    numbers: Tensor,
-    *,
-    max_steps: int,
-    constants: dict[str, float],
-) -> None:
-    """March the rays of a queue to the surface of one three-dimensional network up to 128 units wide.
-
-    ``numbers`` ``(3,)`` are tolerance, resolution and Lipschitz constant of `sphere_trace`, on the device;
-    ``constants`` are those of `march_constants`. Results go to ``marched``; the state of the queue changes.
-    """
+def march_rays(asked: March) -> None:
+    """March the rays of a queue to the surface of one three-dimensional network up to 128 units wide."""
+    levels, rays, queue, marched, numbers, max_steps, constants = asked
     (network,) = levels.networks
     rows = network.shape.rows
     kept = network.shape.scratch(rows, jet=False)

@@ -26,8 +26,8 @@ COARSE = {"tolerance": 1e-3, "resolution": 1e-2}
 @pytest.fixture
 def counted(watch: Callable[..., list[int]]) -> list[int]:
     """How many rays were marched each time, by one network or by levels: the latter count as negative."""
-    watch(fused, "march_rays", lambda levels, rays, *_: len(rays[0]))
-    return watch(banded, "march_levels", lambda levels, rays, *_: -len(rays[0]))
+    watch(fused, "march_rays", lambda asked: len(asked.rays.origins))
+    return watch(banded, "march_levels", lambda asked: -len(asked.rays.origins))
 
 
 def ball(place: torch.device, width: int = 16) -> Siren:
