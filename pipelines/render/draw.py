@@ -71,45 +71,31 @@ class Subject:
     view: Callable[[Camera, Panel], Seen]
 
 
-def open_subject(
-    source: str | Path,
-    *,
-    time: float | None = None,
-    level: int | None = None,
-    normal_level: int | None = None,
-    levels: bool = False,
-    device: torch.device | str = "cpu",
-) -> Subject:
-    """Open a run, a .safetensors file, a mesh or a cloud; see `RenderOptions` for the arguments.
+def open_subject(source: str | Path, options: RenderOptions | None = None) -> Subject:
+    """Open a run, a .safetensors file, a mesh or a cloud, at the time and with the levels of the ``options``.
 
     Raises an InputError if it cannot be read or there is no such level.
     """
+    options = options or RenderOptions()
     if is_field(source):
-        return _field_subject(find_field(source), time, level, normal_level, levels, device)
-    for flag, given in (("--level", level), ("--normal-level", normal_level), ("--levels", levels or None)):
-        if given is not None:
-            raise InputError(f"{flag}: {source} has no levels; render the run that it was made from")
-    if time is not None:
-        raise InputError(f"--time {time:g}: {source} does not move; leave it out")
+        return _field_subject(find_field(source), options)
+    given = {"--level": options.level, "--normal-level": options.normal_level, "--levels": options.levels or None}
+    for flag in (flag for flag, value in given.items() if value is not None):
+        raise InputError(f"{flag}: {source} has no levels; render the run that it was made from")
+    if options.time is not None:
+        raise InputError(f"--time {options.time:g}: {source} does not move; leave it out")
     return _surface_subject(Path(source))
 
 
-def _field_subject(
-    file: Path,
-    time: float | None,
-    level: int | None,
-    normal_level: int | None,
-    levels: bool,
-    device: torch.device | str,
-) -> Subject:
-    field, similarity, metadata = load_still(file, time, device=device)
+def _field_subject(file: Path, options: RenderOptions) -> Subject:
+    field, similarity, metadata = load_still(file, options.time, device=choose_device(options.device))
     finest = field.num_levels - 1
-    level = chosen_level(field, file, level)
-    normal_level = chosen_level(field, file, normal_level, otherwise=level, flag="--normal-level")
+    level = chosen_level(field, file, options.level)
+    normal_level = chosen_level(field, file, options.normal_level, otherwise=level, flag="--normal-level")
     panels = [_panel(level, normal_level)]
-    if levels:
+    if options.levels:
         panels = [_panel(index, index) for index in range(finest + 1)] + ([_panel(0, finest)] if finest else [])
-    colors = colors_of_run(file, field, time) if file.with_name(TEXTURE_FILE).is_file() else None
+    colors = colors_of_run(file, field, options.time) if file.with_name(TEXTURE_FILE).is_file() else None
     subject = subject_of(field, similarity, name=file, panels=panels, colors=colors)
     source = lambda: fitted_cloud(file, metadata, remedy="name it with --reference FILE")  # noqa: E731
     return dataclasses.replace(subject, fitted_to=source)
@@ -361,14 +347,7 @@ def render_run(
         raise InputError(f"{out}: films know no transparency; write a .png, or give a background")
     if options.sides > 1 and (film or options.cameras is not None):
         raise InputError("--sides: goes with a picture of the orbit, not with a film or --cameras; leave it out")
-    subject = open_subject(
-        source,
-        time=options.time,
-        level=options.level,
-        normal_level=options.normal_level,
-        levels=options.levels,
-        device=choose_device(options.device),
-    )
+    subject = open_subject(source, options)
     artist = _Artist(subject, options, painter)
     cameras = _cameras(subject, options, film=film)
     artist.fit_limits(cameras)

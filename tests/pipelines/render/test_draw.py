@@ -273,7 +273,7 @@ def test_limits_and_legends_are_in_input_units(shapes, draw, capsys, shading, po
 
 @pytest.mark.slow
 def test_the_error_is_the_distance_between_surfaces(shapes):
-    subject = open_subject(shapes / "blob.safetensors", level=0)
+    subject = open_subject(shapes / "blob.safetensors", RenderOptions(level=0))
     distance = reference_distance(subject, None)  # the cloud is on level 1
     seen = subject.view(orbit(subject.outline(), width=40, height=40), subject.panels[0])
     gap = INSET / blob_gradient(seen.position).norm(dim=1)
