@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt
-from torch import Tensor, nn
+from torch import Tensor
 
 from ...datasets.cameras import Camera
 from ...datasets.views.images import OBJECT, PosedImage, PosedImages
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
 from ...neural_fields.fields.losses import data_loss, eikonal_loss
 from ...neural_fields.networks.grids import ValueGrid
+from ...neural_fields.tracing.sphere import ball_points
 from ...neural_fields.volume.weights import sphere_span
 from ..training.settings import ReconstructConfig
 from ..training.trainer import seeded
@@ -401,7 +402,7 @@ def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int =
     adam = torch.optim.Adam(network.parameters(), lr=HULL.rate, betas=(0.9, 0.99))
     with seeded(seed):
         for step in range(steps):
-            points = _in_ball(HULL.batch).to(place)
+            points = ball_points(HULL.batch, radius=1.0, generator=torch.default_generator).to(place)
             jet = network.jet(points)
             loss = HULL.data_weight * data_loss(jet.value, grid(points)) + HULL.eikonal_weight * eikonal_loss(
                 jet.gradient
@@ -412,9 +413,3 @@ def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int =
             loss.mean().backward()
             adam.step()
     network.set_units(*units)
-
-
-def _in_ball(count: int) -> Tensor:
-    """Points ``(count, 3)``, evenly spread in the unit ball."""
-    directions = nn.functional.normalize(torch.randn(count, 3), dim=1)
-    return torch.rand(count, 1) ** (1 / 3) * directions

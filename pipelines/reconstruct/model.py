@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -131,43 +131,16 @@ class SceneModel(nn.Module):
         behind = (1 - rendered.opacity)[:, None] * self.background
         return gain * (rendered.color - behind) + rendered.opacity[:, None] * offset + behind
 
-    def render(
-        self,
-        origins: Tensor,
-        directions: Tensor,
-        sampling: Sampling,
-        *,
-        cos_anneal: Tensor | float = 1.0,
-        level: int = -1,
-        early_stop_eps: float = 0.0,
-        alpha_threshold: float = 0.0,
-        skip_share: float = 0.0,
-        sdf_grid: Callable[[Tensor], Tensor] | None = None,
-        generator: torch.Generator | None = None,
-    ) -> Rendered:
-        """`render_volume` of this scene, with colours in half precision on a GPU."""
+    def render(self, origins: Tensor, directions: Tensor, sampling: Sampling, **options: Any) -> Rendered:
+        """`render_volume` of this scene, with its ``options``, and with colours in half precision on a GPU."""
 
         def color(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
             with torch.autocast(x.device.type, torch.bfloat16, enabled=x.device.type in HALF_PRECISION):
                 return self.color(x, direction, jet).float()
 
-        return render_volume(
-            self.geometry,
-            color,
-            origins,
-            directions,
-            inv_std=self.inv_std,
-            sampling=sampling,
-            cos_anneal=cos_anneal,
-            level=level,
-            background=self.background,
-            outside=self.outside,
-            early_stop_eps=early_stop_eps,
-            alpha_threshold=alpha_threshold,
-            skip_share=skip_share,
-            sdf_grid=sdf_grid,
-            generator=generator,
-        )
+        behind = {"background": self.background, "outside": self.outside}
+        rays = (origins, directions)
+        return render_volume(self.geometry, color, *rays, inv_std=self.inv_std, sampling=sampling, **behind, **options)
 
 
 def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -> SceneModel:

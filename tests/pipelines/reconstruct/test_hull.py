@@ -9,6 +9,7 @@ import pytest
 import torch
 from mplicits.datasets import SCENES, PosedImages, render_scene
 from mplicits.neural_fields import InputError, Siren
+from mplicits.neural_fields.tracing.sphere import ball_points
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct.hull import (
@@ -121,7 +122,7 @@ def test_masks_that_leave_nothing_are_no_start() -> None:
 def test_a_network_is_trained_to_it() -> None:
     network = Siren(24, 2, omega=6.0)
     start_at_hull(network, lengths(13) - RADIUS, steps=80)
-    points = 0.9 * hull._in_ball(200)
+    points = 0.9 * ball_points(200, radius=1.0, generator=torch.Generator().manual_seed(3))
     with torch.no_grad():
         error = network.value(points) - (points.norm(dim=1) - RADIUS)
     assert float(error.abs().mean()) < 0.03  # it has begun at about ± 0.5
