@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import functools
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ..training.settings import given_flags
@@ -134,13 +135,19 @@ def _common_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--center", action="store_true", help="put the middle of the mesh at the origin")
 
 
-def _report(arguments: argparse.Namespace, made: Made, started: float) -> None:
+def _make_solid(arguments: argparse.Namespace, make: Callable[..., Made]) -> int:
+    """Make the solid, which says what was removed, and print its figures."""
+    from ..mesh.solids import SolidOptions
+
+    started = time.monotonic()
+    made = make(arguments.out, SolidOptions(**given_flags(arguments, SolidOptions)), say=print)
     unit = f" {arguments.unit}" if arguments.unit else " input units"
     closed = "closed" if made.closed else "NOT closed"
     print(
         f"{arguments.out}: {len(made.mesh.vertices):,} vertices, {len(made.mesh.faces):,} faces, {closed}, "
         f"volume {made.volume:.6g}{unit}³, in {time.monotonic() - started:.1f} s"
     )
+    return 0
 
 
 def _boolean_arguments(parser: argparse.ArgumentParser) -> None:
@@ -159,13 +166,10 @@ def _boolean_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _boolean(arguments: argparse.Namespace) -> int:
-    from ..mesh.solids import SolidOptions, boolean
+    from ..mesh.solids import boolean
 
-    started = time.monotonic()
-    options = SolidOptions(**given_flags(arguments, SolidOptions))
-    made = boolean(arguments.parts, arguments.operation, arguments.out, options, smooth=arguments.smooth, say=print)
-    _report(arguments, made, started)
-    return 0
+    parts, operation = arguments.parts, arguments.operation
+    return _make_solid(arguments, functools.partial(boolean, parts, operation, smooth=arguments.smooth))
 
 
 BOOLEAN = Command(
@@ -190,13 +194,9 @@ def _offset_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _offset(arguments: argparse.Namespace) -> int:
-    from ..mesh.solids import SolidOptions, offset
+    from ..mesh.solids import offset
 
-    started = time.monotonic()
-    options = SolidOptions(**given_flags(arguments, SolidOptions))
-    made = offset(arguments.run, arguments.by, arguments.out, options, shell=arguments.shell, say=print)
-    _report(arguments, made, started)
-    return 0
+    return _make_solid(arguments, functools.partial(offset, arguments.run, arguments.by, shell=arguments.shell))
 
 
 OFFSET = Command(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from ...datasets import read_cloud
 from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import vertex_normals
-from ...neural_fields import Field, InputError, Mesh, Similarity
+from ...neural_fields import Field, InputError, Mesh
 from ...neural_fields.backend.devices import upload
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh, map_normals
 from ...neural_fields.tracing.sphere import map_attribute
@@ -213,7 +214,12 @@ def export_run(
     if line is not None and say is not None:
         say(f"coordinates: {line}")
     if options.texture is not None:
-        return Exported(_write_textured(out, mesh, field, colors, similarity, options, options.texture))
+        mapped = field.num_levels - 1 if options.normal_level is None else normal_level
+        colors_at = None if colors is None else functools.partial(_evaluated, colors)
+        normals_at = functools.partial(normals_near, field, level=mapped)
+        size, faces = options.texture, options.texture_faces
+        baked = (mesh, similarity, colors_at, normals_at)
+        return Exported(textured_mesh(out, *baked, size=size, faces=faces, placement=placement))
     if colors is not None:
         mesh = dataclasses.replace(mesh, colors=_evaluated(colors, mesh.vertices))
     write_mesh(out, mesh, similarity, placement)
@@ -283,26 +289,3 @@ def _unit_normals(field: Field, mesh: Mesh, *, level: int) -> NDArray[np.float32
     lost = ~normals.any(axis=1)
     normals[lost] = vertex_normals(mesh.vertices, mesh.faces.astype(np.int64))[lost]
     return unit_rows(normals).astype(np.float32)
-
-
-def _write_textured(
-    out: str | Path,
-    mesh: Mesh,
-    field: Field,
-    colors: Colors | None,
-    similarity: Similarity,
-    options: MeshOptions,
-    size: int,
-) -> Mesh:
-    """Bake the colours, if any, and normals of ``options.normal_level``, by default the finest → the written mesh."""
-    level = field.num_levels - 1 if options.normal_level is None else options.normal_level
-    return textured_mesh(
-        out,
-        mesh,
-        similarity,
-        None if colors is None else lambda points: _evaluated(colors, points),
-        lambda points: normals_near(field, points, level=level),
-        size=size,
-        faces=options.texture_faces,
-        placement=placement_of(options.up, options.unit, options.center),
-    )

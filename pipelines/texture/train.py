@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets import PointCloud, read_cloud
+from ...datasets.clouds.point_cloud import select
 from ...datasets.textured.reading import TEXTURED_READERS, read_textured, sample_textured
 from ...neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture
 from ...neural_fields.backend.devices import upload
@@ -367,9 +368,7 @@ def texture_run(
 def _thinned(cloud: PointCloud, share: float, seed: int) -> PointCloud:
     """That share of the points, but at least `FEWEST_COLORED`, drawn by the seed."""
     count = min(len(cloud), max(int(share * len(cloud)), FEWEST_COLORED))
-    kept = np.sort(np.random.default_rng(seed).permutation(len(cloud))[:count])
-    normals, colors = (None if rows is None else rows[kept] for rows in (cloud.normals, cloud.colors))
-    return dataclasses.replace(cloud, points=cloud.points[kept], normals=normals, colors=colors)
+    return select(cloud, np.sort(np.random.default_rng(seed).permutation(len(cloud))[:count]))
 
 
 def _fingerprint(cloud: PointCloud, geometry: Field) -> str:
