@@ -206,14 +206,6 @@ def sample_scene(scene: Scene, count: int, *, seed: int = 0) -> PointCloud:
     return replace(cloud, colors=scene.color(cloud.points).astype(np.float32), source=scene.name)
 
 
-def _painted_sphere() -> Scene:
-    return Scene("painted-sphere", Sphere(radius=0.6), _spots, radius=0.6)
-
-
-def _striped_torus() -> Scene:
-    return Scene("striped-torus", Torus(major=0.45, minor=0.2), _stripes, radius=0.65, up="z")
-
-
 def _figure() -> Scene:
     corners = [(x, -0.2, z) for x in (-0.24, 0.24) for z in (-0.24, 0.24)]
     field = Union(
@@ -311,6 +303,11 @@ def lit(light: NDArray[np.floating], normals: Float64, directions: Float64, *, s
 
 
 SCENES: Mapping[str, Callable[[], Scene]] = MappingProxyType(
-    {"painted-sphere": _painted_sphere, "striped-torus": _striped_torus, "figure": _figure, "statue": _statue}
+    {
+        "painted-sphere": lambda: Scene("painted-sphere", Sphere(radius=0.6), _spots, radius=0.6),
+        "striped-torus": lambda: Scene("striped-torus", Torus(major=0.45, minor=0.2), _stripes, radius=0.65, up="z"),
+        "figure": _figure,
+        "statue": _statue,
+    }
 )
 """Makers of scenes by name."""
