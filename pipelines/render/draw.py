@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
@@ -359,14 +360,7 @@ def render_run(
 
 
 def render_shape(
-    shape: WorldField,
-    path: str | Path | None = None,
-    *,
-    size: int | tuple[int, int] = 640,
-    level: int = -1,
-    up: str = "y",
-    azimuth: float = 30.0,
-    elevation: float = 15.0,
+    shape: WorldField, path: str | Path | None = None, *, size: int | tuple[int, int], level: int, **orbit: Any
 ) -> Image:
     """Draw a field that need not be in a file; see `WorldField.render`."""
     if path is not None:
@@ -374,8 +368,7 @@ def render_shape(
     level = shape.field.resolve_level(level)
     panels = [Panel(f"level {level}", level, level)]
     subject = subject_of(shape.field, shape.similarity, name=Path(path or "shape"), panels=panels)
-    orbit = Orbit(azimuth=azimuth, elevation=elevation, up=up)
-    options = RenderOptions(size=size if isinstance(size, tuple) else (size,), orbit=orbit)
+    options = RenderOptions(size=size if isinstance(size, tuple) else (size,), orbit=Orbit(**orbit))
     picture = next(_Artist(subject, options).pictures([_cameras(subject, options, film=False)], None))
     if path is not None:
         write_picture(path, picture)

@@ -19,7 +19,7 @@ from torch.nn.functional import grid_sample, normalize
 
 from ...datasets.cameras import Camera
 from ...neural_fields import Field, InputError
-from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
+from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, ball_crossing
 from ..training.settings import SHADINGS, ShadeOptions
 from .picture import Image
 from .trace import Seen
@@ -69,7 +69,7 @@ def soft_shadow(
     rows = (height > 0).nonzero()[:, 0]
     slope = height[rows].clamp(max=softness)
     start = _lifted(field, points[rows], normals[rows], level=level, offset=offset)
-    left = _way_out(start, lamp, bound)
+    left = ball_crossing(start, lamp.expand_as(start), bound)[1]
     t = torch.full_like(left, offset)
     least = torch.ones_like(left)
     for _ in range(max_steps):
@@ -110,13 +110,6 @@ def _lifted(field: Field, points: Tensor, normals: Tensor, *, level: int, offset
     """Points moved along their normals to ``offset`` above the surface of ``level``, if they are not higher."""
     height = field.value(points, level=level)
     return points + (offset - height).clamp(min=0)[:, None] * normals
-
-
-def _way_out(start: Tensor, direction: Tensor, bound: float) -> Tensor:
-    """Distance along ``direction`` at which rays leave the ball of radius ``bound``; 0 or less if they are out."""
-    along = start @ direction
-    inside = along * along - (start * start).sum(-1) + bound * bound
-    return torch.where(inside > 0, inside.clamp(min=0).sqrt() - along, 0)
 
 
 def _light_through(u: Tensor) -> Tensor:
@@ -232,7 +225,6 @@ def _display(linear: NDArray[np.floating]) -> Float32:
     return (linear.clip(0, 1) ** (1 / 2.2)).astype(np.float32)
 
 
-Float32 = NDArray[np.float32]
 Color = tuple[float, float, float]
 
 GAMMA = 2.2  # between display values, in which images are stored, and light, which adds up
