@@ -223,14 +223,14 @@ def _evolve_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _evolve(arguments: argparse.Namespace) -> int:
     config, fits = _evolve_settings(arguments), load_config(FitConfig, arguments.fits)
-    from ..evolve.scans import fits_beside, fitted_scans, scans_among
+    from ..evolve.scans import fitted_scans, scans_among
     from ..evolve.train import evolve
     from ..training.folder import check_new_run
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     scans = {} if arguments.resume else scans_among(config.shapes)
     if scans:
-        folder, given = fits_beside(directory), config.landmarks
+        folder, given = directory.with_name(f"{directory.name}-fits"), config.landmarks
         with training("to continue: the same command", quiet=arguments.quiet) as report:
             config = fitted_scans(config, scans, folder, fits, progress=report)
         print(f"{folder}: the fits of {', '.join(scans)}")

@@ -31,11 +31,6 @@ class FrameFigures:
     holes: int  # through them
     slope_error: float | None  # mean of ||∇f| − 1| at its vertices; None where there are none
 
-    @property
-    def topology(self) -> Topology:
-        """Of the surface."""
-        return Topology(self.components, self.holes)
-
 
 def check_evolution(
     field: Field,
@@ -63,7 +58,7 @@ def check_evolution(
         count(frames + len(met), total)
     slopes = slope_figures(field)
     count(total - 1, total)
-    times, found = [frame.time for frame in shown], [frame.topology for frame in shown]
+    times, found = [frame.time for frame in shown], [Topology(frame.components, frame.holes) for frame in shown]
     changes = find_changes(field, times, found, resolution=resolution, until=until)
     count(total, total)
     place = similarity or Similarity.identity()

@@ -19,7 +19,7 @@ from ..training.progress import Report
 from ..training.scaffold import BUDGET, Budget, affordable
 from ..training.settings import EvolveConfig
 from .deform import carried_samples, learn_motion, motion_figures
-from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform, values_at
+from .samples import Bounds, Carried, Known, around, joined, known_at, signs, uniform, values_at
 from .shapes import Placement, StaticShape, aligned, into_unit_sphere
 
 END_POINTS = 50_000  # on a surface that shall be met
@@ -216,7 +216,7 @@ def _transport(shapes: list[StaticShape], config: EvolveConfig, budget: Budget |
             t = torch.rand(each, generator=generator) * (torch.rand(each, generator=generator) > 0.25)
             points.append(at_time(flow(velocity, y, 0.0, t), t))
         known = carried.samples(torch.cat(points))
-        return (known, no_bounds()) if rigid else signs(known)
+        return (known, Bounds(torch.empty(0, 4), torch.empty(0), torch.empty(0))) if rigid else signs(known)
 
     known, bounds, number = _sampled(samples, config, budget)
     law = transport(velocities[0], extend=not rigid) if len(placed) == 1 else None

@@ -124,11 +124,6 @@ def joined(parts: Sequence[Known]) -> Known:
     return Known(points, value, gradient)
 
 
-def no_bounds() -> Bounds:
-    """No samples."""
-    return Bounds(torch.empty(0, 4), torch.empty(0), torch.empty(0))
-
-
 def _first_near(field: Field, points: Tensor, count: int, width: float) -> Tensor:
     """The first ``count`` of ``points`` with |f| < ``width`` at the coarsest level; later ones are not asked."""
     near, found = [points[:0]], 0

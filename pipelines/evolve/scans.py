@@ -27,11 +27,6 @@ def scans_among(shapes: Sequence[str]) -> dict[str, Mesh]:
     return {text: read_surface(text) for text in files}
 
 
-def fits_beside(run: Path) -> Path:
-    """The folder for the fits of a run."""
-    return run.with_name(f"{run.name}-fits")
-
-
 def fitted_scans(
     config: EvolveConfig, scans: Mapping[str, Mesh], folder: Path, fits: FitConfig, *, progress: Report | None = None
 ) -> EvolveConfig:

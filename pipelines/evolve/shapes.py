@@ -254,7 +254,6 @@ def _axes(surface: Mesh) -> Float64:
     return axes
 
 
-Float64 = NDArray[np.float64]
 FAR_OUT = 0.1  # how far from its surface a landmark may lie, in units of the field: fits and picks are not exact
 
 

@@ -133,9 +133,6 @@ def _laid(vectors: Float64, normals: Float64) -> Float64:
     return unit_rows(vectors - (vectors * normals).sum(axis=1, keepdims=True) * normals)
 
 
-Float64 = NDArray[np.float64]
-
-
 @dataclass(frozen=True)
 class Decimation:
     """What a decimation has cost; ``largest`` and ``mean`` distance are in the units of the mesh, both ways.

@@ -122,7 +122,6 @@ def _seen_through(
     return through / told if told >= 50 else None
 
 
-Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 

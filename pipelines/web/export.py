@@ -23,7 +23,7 @@ from ..training.folder import chosen_level, find_field, fitted_cloud, is_field, 
 from .assembly import fill_page, write_folder
 from .payload import Payload, Rounding, network_layers, rounding_error, shader_levels, taper_of
 from .shapes import Shape, add_shape, distance_cloud, field_shapes, read_shape
-from .shell import GRID, MOMENTS, band_reach, shell_mesh, surface_reach, swept_shell
+from .shell import GRID, MOMENTS, shell_mesh, surface_reach, swept_shell
 
 PAGES = (".html", ".htm")
 BITS = 13
@@ -178,14 +178,15 @@ def pack_field(
     payload.add_steps("shell.faces", shell.faces)
     page = WebPage(0, len(levels), colors is not None, len(shell.faces), tuple(rounding))
     outline = np.concatenate([points for _, points in outlines])
+    deltas = [float(delta) for delta in field.deltas]
+    bands = [deltas[:level] for level in range(field.num_levels)]  # what `surface_reach` is at most, at any moment
     header = {
         "moves": moving is not None,
         "levels": levels,
         "colors": colors,
-        "deltas": [float(delta) for delta in field.deltas],
+        "deltas": deltas,
         "taper": taper_of(stills[0]),
-        # What a film's levels reach at every moment is not known; their bands are.
-        "reach": surface_reach(field) if moving is None else band_reach(field),
+        "reach": surface_reach(field) if moving is None else bands,
         "shell": {"low": low.tolist(), "high": high.tolist(), "grid": GRID, "triangles": len(shell.faces)},
         "bits": bits,
         "rounding": [dataclasses.asdict(part) for part in rounding],

@@ -125,12 +125,6 @@ def fastest_change(field: SpaceTimeSDF) -> float:
     return fastest
 
 
-def band_reach(field: Field) -> list[list[float]]:
-    """The δ of the levels before each level: what `surface_reach` is at most, at any moment."""
-    deltas = [float(delta) for delta in field.deltas]
-    return [deltas[:level] for level in range(field.num_levels)]
-
-
 def swept_shell(field: SpaceTimeSDF) -> Mesh:
     """A mesh around the bands of all moments (`shell_mesh` of `Swept`); raises NoSurfaceError."""
     return shell_mesh(Swept(field, fastest_change(field)).requires_grad_(False))

@@ -11,7 +11,7 @@ from mplicits.neural_fields import Similarity, Sphere, save_field
 from mplicits.neural_fields.backend.files import write_json
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve import scans
-from mplicits.pipelines.evolve.scans import fits_beside, fitted_scans, scans_among
+from mplicits.pipelines.evolve.scans import fitted_scans, scans_among
 from mplicits.pipelines.evolve.shapes import read_landmarks
 from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.training.folder import FIELD_FILE, RECORD_FILE, read_record
@@ -47,7 +47,7 @@ def test_poses_of_one_mesh_are_fitted_once_and_are_landmarks(poses: list[str], t
     config = replace(QUICK, kind="deform", velocity=(0.0, 0.0, 0.0), shapes=(poses[0], poses[1], "sphere:0.4"))
     found = scans_among(config.shapes)
     assert list(found) == poses
-    folder = fits_beside(tmp_path / "run")
+    folder = tmp_path / "run-fits"
     fitted = fitted_scans(config, found, folder, FITS)
     assert fitted.shapes == (str(folder / "00-first"), str(folder / "01-second"), "sphere:0.4")
     assert fitted.landmarks == ()  # a formula has no vertices
