@@ -19,7 +19,7 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "cloud.ply": lambda path: write_cloud_ply(path, PointCloud(np.ones((5, 3)))),
     "figures.json": lambda path: write_json(path, {"one": 1}),
     "field.safetensors": lambda path: save_field(path, Siren(8, 1)),
-    **dict.fromkeys(("mesh.glb", "mesh.obj"), lambda path: write_mesh(path, extract_mesh(Sphere(), resolution=8))),
+    **dict.fromkeys(("m.glb", "m.obj", "m.ply"), lambda path: write_mesh(path, extract_mesh(Sphere(), resolution=8))),
     **dict.fromkeys(("picture.jpg", "picture.png"), lambda path: write_picture(path, np.zeros((9, 8, 3), np.uint8))),
     "state.safetensors": lambda path: save_state(path, {}, {"step": 1}),
     "text.txt": lambda path: write_whole(path, "text\r\n"),

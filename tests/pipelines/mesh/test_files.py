@@ -102,17 +102,3 @@ def test_bad_path_is_one_line_before_any_work(tmp_path, name, words):
         check_mesh_path(tmp_path / name)
     assert "\n" not in str(error.value)
     assert str(tmp_path / name) in str(error.value)
-
-
-def test_failure_keeps_the_old_file(tmp_path, mesh, monkeypatch):
-    target = tmp_path / "mesh.ply"
-    target.write_text("old")
-
-    def full(self, other):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(type(target), "replace", full)
-    with pytest.raises(InputError, match="No space left on device"):
-        write_mesh(target, mesh)
-    assert target.read_text() == "old"
-    assert [file.name for file in tmp_path.iterdir()] == ["mesh.ply"]
