@@ -175,11 +175,6 @@ class CloudDistance:
         self.given, self.repaired = len(points) if given is None else given, repaired
         self.gaps: Float32 = np.sqrt(self.areas) if gaps is None else gaps
 
-    @property
-    def filled(self) -> float:
-        """Share of the area that belongs to densifying points."""
-        return float(self.areas[self.given :].sum() / self.areas.sum())
-
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Indices ``(count,)`` drawn with replacement, in proportion to the weights."""
         return drawn(torch.from_numpy(self.weights).double().cumsum(0), count, generator)

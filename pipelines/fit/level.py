@@ -108,6 +108,12 @@ def held_out(
     return chosen[owner]
 
 
+def noisy_points(count: int, share: float, options: JudgeOptions = JUDGE) -> int:
+    """How many of ``count`` points are set apart with their noise: the share `spared`, none of a small cloud."""
+    spared = math.ceil(max(options.spared, share) * count)
+    return spared if share and spared >= options.fewest else 0
+
+
 def voxels_of(points: NDArray[np.float32], spacing: float, options: JudgeOptions = JUDGE) -> NDArray[np.int64]:
     """The voxel ``(N,)`` of each point, numbered from 0; its edge is `voxel` times the ``spacing``."""
     cells = np.floor(points.astype(np.float64) / (options.voxel * spacing)).astype(np.int64)
@@ -160,6 +166,7 @@ class Verdict(NamedTuple):
     fall: Fall
     learnt: float = 1.0  # root mean square of |f| at the training points over that without the level
     guessed: bool = False  # whether the normals were estimated
+    noisy: bool = False  # whether the points have their noise, so that the loss is f² alone
 
     @property
     def better(self) -> bool:
@@ -168,7 +175,11 @@ class Verdict(NamedTuple):
         The loss weighs distance and angle as the training does. Either may grow where the surface comes nearer: the
         distance to points that smoothing has rounded off, the angle to normals of vertices, which are means of those of
         faces. Estimated normals share the noise of the points: with them the distance may not be significantly more.
+        The noise of points that were set apart is independent of the level: f² there falls where the surface comes
+        nearer to the truth, and no significance is needed.
         """
+        if self.noisy:
+            return self.after.loss < self.before.loss
         sound = self.fall.distance > -JUDGE.surely if self.guessed else self.after.loss < self.before.loss
         return (max(self.fall) > JUDGE.surely and sound) or self.learns
 
@@ -190,7 +201,9 @@ class Verdict(NamedTuple):
         distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}{{}} ({_sure(fall)})" for b, a, fall, unit in pairs)
         errors = f"mean distance {distance.format('')}, mean angle of the normals {angle.format('°')}"
         errors += f", loss {self.before.loss:.3g} → {self.after.loss:.3g}"
-        if self.learns and max(self.fall) <= JUDGE.surely:
+        if self.noisy:
+            errors += ", the mean square of noisy points' distances"
+        elif self.learns and max(self.fall) <= JUDGE.surely:
             errors += f"; at the points it was trained on the root mean square is {self.learnt:.2f} of what it was"
         return f"level {level} {judged}: without it → with it, at {self.points:,} points held out: {errors}"
 
@@ -250,6 +263,7 @@ class Judge:
         normal: float,
         scales: RobustScales = SQUARES,
         guessed: bool = False,
+        noisy: bool = False,
         options: JudgeOptions = JUDGE,
     ) -> None:
         self.options = options
@@ -257,7 +271,7 @@ class Judge:
         samples = Samples(points, distance=torch.zeros(len(points)), normal=normals, area=areas)
         self.samples = with_previous(samples, previous, delta, device=previous.like.device)
         self.data, self.normal, self.scales, self.count = data, normal, scales, len(self.samples)
-        self.guessed = guessed
+        self.guessed, self.noisy = guessed, noisy
         self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing, options=self.options))
         assert self.samples.value is not None
         assert self.samples.gradient is not None
@@ -281,7 +295,7 @@ class Judge:
         """The verdict on a level with these errors, kept after the fraction ``at`` of its steps."""
         pairs = zip(self.without[1:3], each[1:3], strict=True)
         fall = Fall(*(standard_errors(before - after, self.voxels, each.areas) for before, after in pairs))
-        return Verdict(self.count, self.before, each.mean(), at, fall, guessed=self.guessed)
+        return Verdict(self.count, self.before, each.mean(), at, fall, guessed=self.guessed, noisy=self.noisy)
 
     def _errors(self, value: Tensor, gradient: Tensor) -> Each:
         distance, normal = self.samples.distance, self.samples.normal

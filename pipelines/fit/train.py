@@ -35,7 +35,7 @@ from ..training.trainer import (
 )
 from .cloud import CloudDistance, load_cloud
 from .densification import dense_distance
-from .level import JUDGE, LEVEL, Judge, LevelObjective, calm_omega, held_out, new_level
+from .level import JUDGE, LEVEL, Judge, LevelObjective, calm_omega, held_out, new_level, noisy_points
 from .review import review_points
 from .samples import DOMAIN, Band, Source, band_of, banded_sources, first_sources, with_wrong_sides
 from .unoriented import Places, Signs, fits_better, give_signs, signed
@@ -130,6 +130,7 @@ def prepare(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
         drop_outliers=config.drop_outliers,
         turn_normals=config.turn_normals,
         smooth_noise=config.smooth_noise and given != "none",  # without normals: after `give_signs`
+        noisy=noisy_points(len(cloud), config.hold_out),
     )
 
 
@@ -227,6 +228,10 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
 
         return step
 
+    def omega(self, level: int) -> float:
+        """The frequency of a level, see `calm_omega`."""
+        return calm_omega(self.config, level, self.cloud.noise if self.cloud.estimated else 0.0)
+
     def indexed(self, level: int) -> CloudDistance:
         """`distances` of a level, made once."""
         self.index = self.index or self.distances(level)
@@ -245,9 +250,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             if not self.trainer_state:
                 self.samples = self.affordable_samples(level, share, started, index, delta)
             config = dataclasses.replace(self.config, samples=self.samples)
-            noisy = self.cloud.estimated and index.filled < 0.5
-            omega = calm_omega(config, level, self.cloud.noise if noisy else 0.0)
-            siren = new_level(config, level, residual=level > 0, omega=omega).to(self.device)
+            siren = new_level(config, level, residual=level > 0, omega=self.omega(level)).to(self.device)
             sources = self.sources(index, delta, config, generator)
             judge = None if delta is None else self.judge(delta, sources[0])
         sampling_seconds = time.monotonic() - started
@@ -354,12 +357,12 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         config, all_points = self.config, self.points.numpy()
         noise, guessed = self.cloud.noise, self.cloud.estimated
         self.spacing = spacing_of(all_points.astype(np.float64))
-        share = config.hold_out if level else 0.0
+        share = config.hold_out if level and self.cloud.noisy is None else 0.0
         self.held = torch.from_numpy(held_out(all_points, self.spacing, share, seed=config.seed))
         points, normals = self.points[~self.held], self.normals[~self.held]
         if not config.between:
             return CloudDistance(points, normals, noise=noise, guessed=guessed)
-        omega = max(config.omegas[: config.num_levels])
+        omega = max(map(self.omega, range(config.num_levels)))
         about = {"noise": noise, "guessed": guessed, "seed": config.seed}
         return dense_distance(points, normals, omega=omega, count=self.filling, **about)
 
@@ -375,12 +378,17 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
 
     def judge(self, delta: float, surface: Source) -> Judge | None:
         """The judge of a residual level, with its loss weights on the surface; None without enough held-out points."""
-        if not self.held.any():
+        index, noisy = self.indexed(len(self.stages)), self.cloud.noisy
+        points, normals = self.points[self.held], self.normals[self.held]
+        terms: dict[str, Any] = {"data": surface.data, "normal": surface.normal, "scales": surface.scales}
+        if noisy is not None:
+            points = torch.from_numpy(noisy)
+            normals = torch.from_numpy(index.normals[index.tree.query(noisy)[1]])
+            terms = {"data": 1.0, "normal": 0.0, "noisy": True}
+        if not len(points):
             return None
         assert self.frozen is not None
-        points, normals = self.points[self.held], self.normals[self.held]
-        areas = torch.from_numpy(self.indexed(len(self.stages)).nearest_gap(points.numpy())[1]) ** 2
-        terms = {"data": surface.data, "normal": surface.normal, "scales": surface.scales}
+        areas = torch.from_numpy(index.nearest_gap(points.numpy())[1]) ** 2
         about = {"spacing": self.spacing, "areas": areas, "guessed": self.cloud.estimated}
         judge = Judge(points, normals, self.frozen, delta, **about, **terms)
         return judge if judge.count >= JUDGE.fewest / 2 else None

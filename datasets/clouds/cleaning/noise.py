@@ -217,20 +217,24 @@ def _growth(near: _Neighbors) -> float:
     return float(np.nanmedian(last)) / max(float(np.nanmedian(first)), 1e-300)
 
 
+def smoothed_level(points: Float64, normals: Float64) -> float:
+    """`noise_level` with estimated normals, from which on `denoise` smooths."""
+    return noise_level(points, normals, thick=NOISE.thick_of_estimated if len(points) < NOISE.dense else NOISE.thick)
+
+
 def denoise(points: Float64, normals: Float64) -> tuple[Float64, Float64, float]:
     """Smoothed points ``(N, 3)``, normals ``(N, 3)`` fitted to them, and the noise level, of normals mostly outward.
 
     Planes and smoothing alternate. Weights by likeness of normals are bilateral (Jones et al., SIGGRAPH 2003); a cloud
     with edges gets further rounds with filtered normals. Without noise: the points, `sharper_normals`, and 0.
     """
-    thick = NOISE.thick_of_estimated if len(points) < NOISE.dense else NOISE.thick
-    level = noise_level(points, normals, thick=thick)
+    level = smoothed_level(points, normals)
     if not level:
         return points, sharper_normals(points, normals), 0.0
     reach = REFIT.reach * level
     for _ in range(REFIT.rounds):
         normals = refit_normals(smooth_along_normals(points, normals, level), normals, reach)
-        level = noise_level(points, normals, thick=thick) or level
+        level = smoothed_level(points, normals) or level
     moved = smooth_along_normals(points, normals, level)
     tree = KDTree(moved)
     fitted = refit_normals(moved, normals, reach, tree=tree)
@@ -239,7 +243,7 @@ def denoise(points: Float64, normals: Float64) -> tuple[Float64, Float64, float]
     fitted = refit_normals(moved, fitted, reach, alike=REFIT.alike_at_first, tree=tree)
     for _ in range(REFIT.edge_rounds):
         normals = filter_normals(moved, fitted, tree=tree)
-        level = noise_level(points, normals, thick=thick) or level
+        level = smoothed_level(points, normals) or level
         moved = smooth_along_normals(points, normals, level, alike=REFIT.alike_moved)
         tree = KDTree(moved)
         fitted = refit_normals(moved, normals, reach, alike=REFIT.alike_after, tree=tree)

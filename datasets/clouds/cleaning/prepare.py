@@ -12,7 +12,14 @@ from scipy.spatial import KDTree
 from ....neural_fields import InputError, Similarity
 from ..point_cloud import Float64, Int64, PointCloud, centred, middle_of, unit_rows, usable_rows, weld
 from ..readers.reading import MIN_POINTS
-from .noise import denoise, noise_deviation, noise_level, replace_bad_normals, smooth_along_normals
+from .noise import (
+    denoise,
+    noise_deviation,
+    noise_level,
+    replace_bad_normals,
+    smooth_along_normals,
+    smoothed_level,
+)
 from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness, query
 from .outliers import agreement, inspect_points
 from .winding import orient_by_winding
@@ -112,6 +119,8 @@ class OrientedCloud:
         colors: ``(N, 3)`` float32 in [0, 1], or None.
         similarity: the way back to input coordinates.
         report: what was dropped, repaired and estimated.
+        noisy: ``(M, 3)`` float32, in the unit sphere: points with their noise, of which `points` and `normals` know
+            nothing; None without noise.
     """
 
     points: NDArray[np.float32]
@@ -119,6 +128,7 @@ class OrientedCloud:
     colors: NDArray[np.float32] | None
     similarity: Similarity
     report: CleaningReport
+    noisy: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -144,6 +154,7 @@ def prepare_cloud(
     drop_outliers: bool = False,
     turn_normals: bool = False,
     smooth_noise: bool = False,
+    noisy: int = 0,
 ) -> OrientedCloud:
     """Clean a cloud, give it oriented unit normals and move it into the unit sphere.
 
@@ -166,6 +177,7 @@ def prepare_cloud(
         smooth_noise: whether to smooth noise off along the normals, if it is wider than the spacing (see
             :mod:`.noise`). Estimated normals are then fitted again, and with ``normals="auto"`` those of a file that
             fit the points less well than planes are replaced first.
+        noisy: how many random points are set apart before noise is smoothed off along estimated normals.
 
     Raises:
         InputError: too few points are left, or ``normals="file"`` and there are none.
@@ -211,7 +223,7 @@ def prepare_cloud(
     points = similarity.to_unit(places[sound])
 
     source: Literal["file", "mesh", "estimated"] = cloud.normals_source
-    flipped, pieces, oriented_by, strays = False, 0, None, int(found.outliers.sum())
+    flipped, pieces, oriented_by, strays, apart = False, 0, None, int(found.outliers.sum()), None
     if unit is not None:
         unit = np.where(found.flipped[:, None], -unit, unit)[sound]
         flipped = normals == "auto" and _plainly_inward(points, unit)
@@ -220,9 +232,13 @@ def prepare_cloud(
         source = "estimated"
         unit, pieces, oriented_by = _estimate(points, neighbors, similarity, sensor_origin)
         if smooth_noise:
-            noisy = points
-            points, unit, noise = denoise(noisy, unit)
-            deviation = noise_deviation(noisy, unit, thick=0.0) * similarity.scale if noise else 0.0
+            if noisy and smoothed_level(points, unit):
+                chosen = np.random.default_rng(0).permutation(len(points)) < noisy
+                apart = points[chosen].astype(np.float32)
+                points, unit, kept = points[~chosen], unit[~chosen], kept[~chosen]
+            before = points
+            points, unit, noise = denoise(before, unit)
+            deviation = noise_deviation(before, unit, thick=0.0) * similarity.scale if noise else 0.0
             noise *= similarity.scale
             if noise and drop_outliers:
                 supported = agreement(points, unit, np.arange(len(points)))[0] >= SUPPORTED
@@ -231,7 +247,7 @@ def prepare_cloud(
                 strays += int((~supported).sum())
     report = CleaningReport(
         read=len(cloud),
-        kept=len(kept),
+        kept=len(kept) + (0 if apart is None else len(apart)),
         dropped_nan=len(cloud) - len(finite),
         dropped_duplicates=len(finite) - len(distinct),
         dropped_isolated=int(found.isolated.sum()),
@@ -248,7 +264,7 @@ def prepare_cloud(
         reestimated_normals=reestimated,
     )
     colors = None if cloud.colors is None else cloud.colors[kept]
-    return OrientedCloud(points.astype(np.float32), unit.astype(np.float32), colors, similarity, report)
+    return OrientedCloud(points.astype(np.float32), unit.astype(np.float32), colors, similarity, report, apart)
 
 
 def _check_enough(count: int, cloud: PointCloud, why: str) -> None:

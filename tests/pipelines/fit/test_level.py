@@ -12,7 +12,17 @@ from fits import SMALL
 from mplicits.datasets import PointCloud, sample_sphere
 from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.fit import describe
-from mplicits.pipelines.fit.level import JUDGE, Error, Fall, Judge, LevelObjective, Verdict, held_out, standard_errors
+from mplicits.pipelines.fit.level import (
+    JUDGE,
+    Error,
+    Fall,
+    Judge,
+    LevelObjective,
+    Verdict,
+    held_out,
+    noisy_points,
+    standard_errors,
+)
 from mplicits.pipelines.fit.samples import RobustScales, Samples, Source, with_previous
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.trainer import Group, Trainer
@@ -205,6 +215,25 @@ def test_a_level_is_kept_if_it_is_surely_better() -> None:
     ):
         assert all(verdict_of(*falls)._replace(**known).better for falls in kept)
         assert not any(verdict_of(*falls)._replace(**known).better for falls in silenced)
+
+
+def test_the_mean_square_at_noisy_points_falls_where_the_surface_comes_nearer() -> None:
+    # Half of the points are `high` above the sphere, half below: the mean square is high² plus that of the error.
+    high, x = 2 * OFF, points(1000)
+    noisy = x * (1 + torch.where(torch.arange(1000) % 2 == 0, high, -high)[:, None] / RADIUS)
+    frozen, about = Sphere(radius=RADIUS - OFF), {"spacing": SPACING, "data": 1.0, "normal": 0.0, "noisy": True}
+    judge = Judge(noisy, x / RADIUS, frozen, 0.1, **about)
+    for error, kept in ((0.1 * OFF, True), (-0.9 * OFF, True), (1.1 * OFF, False), (-1.1 * OFF, False)):
+        verdict = judge.verdict(judge.errors(zero_siren(error - OFF)), 1.0)
+        assert verdict.before.loss == pytest.approx(high**2 + OFF**2, rel=1e-5)
+        assert verdict.after.loss == pytest.approx(high**2 + error**2, rel=1e-5)
+        assert verdict.better is kept
+
+
+@pytest.mark.parametrize(("count", "share", "apart"), [(10_000, 0.01, 500), (10_000, 0.1, 1000), (3999, 0.1, 400)])
+def test_noisy_points_are_a_twentieth_or_more(count: int, share: float, apart: int) -> None:
+    assert noisy_points(count, share) == apart
+    assert noisy_points(count, 0.0) == noisy_points(1000, share) == 0
 
 
 def test_a_verdict_in_words_and_numbers() -> None:

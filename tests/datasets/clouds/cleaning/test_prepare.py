@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from mplicits.datasets import PointCloud, add_noise, prepare_cloud, sample_sphere, sample_surface, sample_torus
+from mplicits.datasets import (
+    PointCloud,
+    add_isotropic_noise,
+    add_noise,
+    prepare_cloud,
+    sample_sphere,
+    sample_surface,
+    sample_torus,
+)
 from mplicits.neural_fields import Box, InputError, Similarity, Sphere, Torus
 
 
@@ -159,3 +167,23 @@ def test_points_that_smoothing_took_to_the_wrong_place_are_dropped():
     gone = np.setdiff1d(np.arange(len(every)), left)
     assert len(gone) == sound.report.dropped_outliers > 0
     assert np.square(off(every.points[gone])).mean() > 2 * np.square(off(every.points[left])).mean()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_points_are_set_apart_with_their_noise(noise):
+    clean = sample_sphere(6000)
+    cloud = add_isotropic_noise(clean, noise)
+    rank = np.arange(6000)  # of each point, as its colour
+    colors = np.stack((rank / 6000, np.zeros(6000), np.zeros(6000)), axis=1).astype(np.float32)
+    prepared = prepare_cloud(PointCloud(cloud.points, None, colors), smooth_noise=True, noisy=300)
+    if not noise:
+        assert prepared.noisy is None
+        return
+    assert prepared.noisy is not None
+    assert prepared.colors is not None
+    given = prepared.similarity.to_unit(cloud.points).astype(np.float32)
+    places = {tuple(place): index for index, place in enumerate(given.tolist())}
+    apart = {places[tuple(place)] for place in prepared.noisy.tolist()}  # each is a point of the file, not moved
+    others = set(np.round(prepared.colors[:, 0] * 6000).astype(int).tolist())
+    assert (len(apart), len(others)) == (300, 5700)
+    assert not apart & others
