@@ -152,7 +152,7 @@ def train_level(
     """Train one new SIREN as level ``level`` of the fit would be, from the same start.
 
     Args:
-        level: whose width, depth, frequency, steps and learning rate in ``config``.
+        level: whose width, depth, frequency, steps and rates in ``config``.
         sources: what it learns from.
         config: settings of the fit.
         generator: draws the batches.
@@ -161,7 +161,8 @@ def train_level(
         stage: name for ``progress``.
     """
     siren = new_level(config, level, residual=residual).to(sources[0].samples.points.device)
-    objective = LevelObjective(siren, sources, learning_rate=config.learning_rates[level], generator=generator)
+    rate, turn = config.learning_rates[level], config.turn
+    objective = LevelObjective(siren, sources, learning_rate=rate, turn=turn, generator=generator)
     Trainer(objective, stage=stage or f"level {level}", steps=config.steps[level]).run(report=progress)
     return siren.requires_grad_(False)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from ...neural_fields import Field, Siren
 from ...neural_fields.backend.devices import upload
@@ -18,7 +19,7 @@ from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss,
 from ..training.settings import EvolveConfig, FitConfig
 from ..training.trainer import Group, Objective, seeded, warm_cosine
 from .cloud import drawn
-from .samples import SQUARES, RobustScales, Samples, Source, with_previous
+from .samples import LEAST, SQUARES, RobustScales, Samples, Source, with_previous
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class LevelOptions:
 
 LEVEL = LevelOptions()
 
-BEST = "best."  # prefix of the best weights in checkpoints
+MEAN, BEST = "mean.", "best."  # prefixes of the mean weights, and of the best of them, in checkpoints
 
 
 def new_level(
@@ -67,6 +68,21 @@ def calm_omega(config: FitConfig, level: int, noise: float, options: LevelOption
     return min(omega, max(config.omegas[0], options.calm / noise)) if noise else omega
 
 
+def siren_groups(siren: Siren, rate: float, turn: float) -> list[Group]:
+    """Parameters of a SIREN for a `Trainer`: hidden matrices by Muon at the peak rate ``turn`` / ω, others by Adam.
+
+    The norm of the change of a hidden layer's phases in a step is then at most about ``turn`` times that of its input,
+    whatever the frequency and the width: ``turn`` radians where all inputs are 1. ``rate`` is Adam's peak rate. Without
+    ``turn``, all are trained by Adam.
+    """
+    names = {f"layers.{layer}.weight" for layer in range(1, siren.depth)} if turn else set()
+    groups: dict[bool, list[nn.Parameter]] = {False: [], True: []}
+    for name, parameter in siren.named_parameters():
+        groups[name in names].append(parameter)
+    hidden = [Group(groups[True], warm_cosine(turn / siren.omega), matrices=True)] if names else []
+    return [Group(groups[False], warm_cosine(rate)), *hidden]
+
+
 @dataclass(frozen=True)
 class JudgeOptions:
     """Numbers of `held_out` and `Judge`."""
@@ -78,11 +94,11 @@ class JudgeOptions:
     learnt: float = 0.8  # root mean square at training points over that without the level: less is a large gain
     voxel: float = 2.0  # edge of a voxel in spacings: about four points, a gap that neighbours can still fill
     surely: float = 2.0  # standard errors
-    # Part of the schedule from which on training ends if distances and angles are both significantly more than
-    # without the level. Levels set to zero in the end had 2.8 to 14 standard errors there (three shapes), kept ones
-    # less (four).
-    hopeless: float = 0.375
-    looks: int = 8  # judgements of a level during its training
+    # In parts of the schedule. Means of weights show in its middle what the falling rate shows at its end.
+    averaged: float = 0.07  # time constant of the mean
+    hopeless: float = 0.4  # when training ends if the score has never been less than without the level
+    patience: float = 0.3  # time without a lesser score after which training ends
+    looks: int = 20  # judgements of a level during its training
 
 
 JUDGE = JudgeOptions()
@@ -270,11 +286,14 @@ class Judge:
         areas = torch.ones(len(points)) if areas is None else areas
         samples = Samples(points, distance=torch.zeros(len(points)), normal=normals, area=areas)
         self.samples = with_previous(samples, previous, delta, device=previous.like.device)
-        self.data, self.normal, self.scales, self.count = data, normal, scales, len(self.samples)
+        self.data, self.normal, self.count = data, normal, len(self.samples)
         self.guessed, self.noisy = guessed, noisy
         self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing, options=self.options))
         assert self.samples.value is not None
         assert self.samples.gradient is not None
+        # Squares of distances at level 1 are mostly those of few points that level 0 has missed.
+        usual = math.inf if noisy or not self.count else float(self.samples.value.square().median())
+        self.scales = scales._replace(data=min(scales.data, max(usual, LEAST.data)))
         self.without = self._errors(self.samples.value, self.samples.gradient)
         self.before = self.without.mean()
 
@@ -287,9 +306,9 @@ class Judge:
         jet = siren.jet(self.samples.points)
         return self._errors(value + jet.value, gradient + jet.gradient)
 
-    def surely_less(self, first: Each, second: Each) -> bool:
-        """Whether the mean of the first losses is less, by more than chance."""
-        return standard_errors(second.loss - first.loss, self.voxels, first.areas) > self.options.surely
+    def score(self, error: Error) -> float:
+        """What the best weights have least of: the loss, or the distance where normals were estimated without noise."""
+        return error.distance if self.guessed and not self.noisy else error.loss
 
     def verdict(self, each: Each, at: float) -> Verdict:
         """The verdict on a level with these errors, kept after the fraction ``at`` of its steps."""
@@ -313,7 +332,7 @@ class Judge:
 class LevelObjective(Objective):
     """The terms of Eq. 4 for one SIREN on ``sources``.
 
-    With a ``judge`` the level returns to earlier weights if those were significantly better, see `take_best`.
+    With a ``judge`` the level gets the mean weights that were best at held-out points, see `take_best`.
     """
 
     def __init__(
@@ -324,20 +343,21 @@ class LevelObjective(Objective):
         learning_rate: float,
         generator: torch.Generator,
         judge: Judge | None = None,
+        turn: float = 0.0,
     ) -> None:
-        super().__init__(siren, [Group(list(siren.parameters()), warm_cosine(learning_rate))], generator)
+        super().__init__(siren, siren_groups(siren, learning_rate, turn), generator)
         self.siren, self.sources, self.judge = siren, sources, judge
         areas = (source.samples.area for source in sources)
         self.shares = [None if area is None else area.cpu().double().cumsum(0) for area in areas]
         if judge is not None:  # `kept` is part of the checkpoints
-            best = {BEST + name: tensor.clone() for name, tensor in siren.state_dict().items()}
-            self.kept = {"looks": torch.zeros(1), "hopeless": torch.zeros(1), "least": torch.full((1,), math.inf)}
-            self.kept |= {"at": torch.ones(1), **best}
+            weights = siren.state_dict()
+            starts = {"looks": 0.0, "averaged": 0.0, "at": 1.0, "least": math.inf}
+            self.kept = {name: torch.tensor(start, dtype=torch.float64) for name, start in starts.items()}
+            self.kept |= {prefix + name: weights[name].clone() for prefix in (MEAN, BEST) for name in weights}
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`: the mean of every term of every source."""
-        if self.judge is not None and int(done * JUDGE.looks) > int(self.kept["looks"]):
-            self.look(done)
+        self.look(done)
         pairs = zip(self.sources, self.shares, strict=True)
         batches = [source.samples.take(self._draw(source, shares)) for source, shares in pairs]
         jet = self.siren.jet(torch.cat([batch.points for batch in batches]))
@@ -360,44 +380,48 @@ class LevelObjective(Objective):
                 terms[f"{source.name}.{name}"] = mean
         return terms, total
 
+    @torch.no_grad()
     def look(self, done: float) -> None:
-        """Judge the level, and keep its weights if they are the best so far."""
+        """Average the weights; at times judge their mean, and keep it if its score is the least so far."""
         if self.judge is None:
             return
+        share = 1 - math.exp((float(self.kept["averaged"]) - done) / JUDGE.averaged)
+        self.kept["averaged"].fill_(done)
+        for name, weights in self.siren.state_dict().items():
+            self.kept[MEAN + name].lerp_(weights, share)
+        if int(done * JUDGE.looks) <= int(self.kept["looks"]):
+            return
         self.kept["looks"].fill_(int(done * JUDGE.looks))
-        errors = self.judge.errors(self.siren)
-        loss = errors.mean().loss
-        if done >= JUDGE.hopeless and max(self.judge.verdict(errors, done).fall) < -JUDGE.surely:
-            self.kept["hopeless"].fill_(1)
-        if loss < float(self.kept["least"]):
-            self.kept["least"].fill_(loss)
+        score = self.judge.score(self.judge.errors(self._with(MEAN)).mean())
+        if score < float(self.kept["least"]):
+            self.kept["least"].fill_(score)
             self.kept["at"].fill_(done)
-            for name, tensor in self.siren.state_dict().items():
-                self.kept[BEST + name].copy_(tensor)
+            for name in self.siren.state_dict():
+                self.kept[BEST + name].copy_(self.kept[MEAN + name])
 
     @property
-    def hopeless(self) -> bool:
-        """See `Objective.hopeless`: the level makes distances and angles at held-out points significantly worse."""
-        return self.judge is not None and bool(self.kept["hopeless"])
+    def settled(self) -> bool:
+        """See `Objective.settled`: held-out points say that the level is no use, or that it gets no better."""
+        if self.judge is None:
+            return False
+        done, at, least = (float(self.kept[name]) for name in ("averaged", "at", "least"))
+        useless = done >= JUDGE.hopeless and least >= self.judge.score(self.judge.before)
+        return useless or (math.isfinite(least) and done >= at + JUDGE.patience)
 
     def take_best(self) -> Verdict | None:
-        """Return to the best weights if they are significantly better → the verdict; None without a judge.
-
-        Otherwise the last weights stay: the decayed learning rate has removed the noise of the batches, which a few
-        hundred points hardly show. Last weights that are no better than none do not stay.
-        """
+        """Take the mean weights of the least score → the verdict; None, and the last weights, without a judge."""
         if self.judge is None:
             return None
-        weights = {name: tensor.clone() for name, tensor in self.siren.state_dict().items()}
-        last = self.judge.errors(self.siren)
-        self.look(1.0)
-        self.siren.load_state_dict({name: self.kept[BEST + name] for name in weights})
-        best, verdict = self.judge.errors(self.siren), self.judge.verdict(last, 1.0)
-        some_use = verdict.after.loss < verdict.before.loss or verdict.better
-        if some_use and not self.judge.surely_less(best, last):
-            self.siren.load_state_dict(weights)
-            return verdict
-        return self.judge.verdict(best, float(self.kept["at"]))
+        if not self.settled:
+            self.look(1.0)
+        self.siren.load_state_dict(self._with(BEST).state_dict())
+        return self.judge.verdict(self.judge.errors(self.siren), float(self.kept["at"]))
+
+    def _with(self, prefix: str) -> Siren:
+        """The level with those of the kept weights."""
+        siren = copy.deepcopy(self.siren)
+        siren.load_state_dict({name: self.kept[prefix + name] for name in siren.state_dict()})
+        return siren
 
     def _draw(self, source: Source, shares: Tensor | None) -> Tensor:
         if shares is None:

@@ -255,8 +255,8 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             judge = None if delta is None else self.judge(delta, sources[0])
         sampling_seconds = time.monotonic() - started
         seconds = None if share == math.inf else self.training_seconds(level, share - sampling_seconds)
-        rate = config.learning_rates[level]
-        objective = LevelObjective(siren, sources, learning_rate=rate, generator=generator, judge=judge)
+        rate, turn = config.learning_rates[level], config.turn
+        objective = LevelObjective(siren, sources, learning_rate=rate, turn=turn, generator=generator, judge=judge)
         trainer = Trainer(objective, stage=f"level {level}", steps=config.steps[level], seconds=seconds)
         if not self.take_steps(trainer, flag, lambda: self.grown(siren, delta)):
             raise Interrupted(self.folder.out)
@@ -289,7 +289,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
                 "sampling_seconds": round(sampling_seconds, 3),
                 "training_seconds": round(trainer.elapsed, 3),
                 "steps": trainer.step,
-                "ended_by_time_budget": trainer.ended_early and not objective.hopeless,
+                "ended_by_time_budget": trainer.ended_early and not objective.settled,
                 "silenced": silenced,
                 "held_out": None if verdict is None else verdict.record(level, scale=self.similarity.scale),
                 "losses": trainer.losses,

@@ -314,7 +314,7 @@ class GraphTrainer(Trainer[SceneObjective]):
         """The device's part of a step."""
         objective = self.objective
         rates = graph_input(
-            lambda: torch.tensor([rate(objective.done) for _, rate in objective.groups]), self.trained[0].device
+            lambda: torch.tensor([group.rate(objective.done) for group in objective.groups]), self.trained[0].device
         )
         for group, rate in zip(self.adam.param_groups, rates.unbind(), strict=True):
             group["lr"] = rate

@@ -1,4 +1,4 @@
-"""The loop that every training goes through: Adam on a schedule, reports, checkpoints, a time budget, a way to stop."""
+"""The loop of every training: Adam and `Muon` on a schedule, reports, checkpoints, a time budget, a way to stop."""
 
 from __future__ import annotations
 
@@ -109,10 +109,53 @@ def warm_cosine(peak: float) -> Rate:
 
 
 class Group(NamedTuple):
-    """Parameters, and their learning rate for a schedule done to a fraction in [0, 1]."""
+    """Parameters, and their learning rate for a schedule done to a fraction in [0, 1].
+
+    They are ``matrices`` that `Muon` trains, or anything, for Adam.
+    """
 
     parameters: Sequence[nn.Parameter]
     rate: Rate
+    matrices: bool = False
+
+
+class Muon(torch.optim.Optimizer):
+    """Descent along matrices that are made orthogonal: ``W ← W − lr · U Vᵀ`` for a gradient ``U S Vᵀ`` with momentum.
+
+    All directions of a matrix are learnt at one speed, so a SIREN needs half of Adam's steps (Jordan et al., "Muon",
+    2024). `torch.optim.Muon` multiplies in bfloat16, which takes longer than the step itself on CPUs without it.
+
+    Args:
+        matrices: groups of them, ``(n, m)`` each.
+        momentum: of the gradient; one step of it is looked ahead (Nesterov).
+        iterations: of the polynomial that takes singular values to between 0.7 and 1.2.
+    """
+
+    def __init__(self, matrices: list[dict[str, Any]], *, momentum: float = 0.9, iterations: int = 5) -> None:
+        super().__init__(matrices, {"lr": 0.0})
+        self.momentum, self.iterations = momentum, iterations
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """One step with the rate ``lr`` of each group: the largest change of a layer over the norm of its input."""
+        for group in self.param_groups:
+            for matrix in group["params"]:
+                mean = self.state[matrix].setdefault("momentum", torch.zeros_like(matrix))
+                mean.lerp_(matrix.grad, 1 - self.momentum)
+                matrix.sub_(orthogonal(matrix.grad.lerp(mean, self.momentum), self.iterations), alpha=group["lr"])
+
+
+def orthogonal(matrix: Tensor, iterations: int = 5) -> Tensor:
+    """About ``U Vᵀ`` of a matrix ``U S Vᵀ`` ``(n, m)``: odd polynomials take its singular values to 0.7 to 1.2.
+
+    The coefficients are those of Jordan et al. (2024), for the steepest slope at 0.
+    """
+    first, third, fifth = 3.4445, -4.7750, 2.0315
+    found = matrix / matrix.norm().clamp_min(torch.finfo(matrix.dtype).tiny)
+    for _ in range(iterations):
+        square = found @ found.T
+        found = torch.addmm(found, torch.addmm(square, square, square, beta=third, alpha=fifth), found, beta=first)
+    return found
 
 
 class Objective(ABC):
@@ -132,7 +175,7 @@ class Objective(ABC):
         self.kept = dict(kept or {})
 
     @property
-    def hopeless(self) -> bool:
+    def settled(self) -> bool:
         """Whether the rest of the schedule is not worth its time."""
         return False
 
@@ -149,7 +192,7 @@ F = TypeVar("F", bound=nn.Module)
 
 
 class Trainer(Generic[O]):
-    """Minimises an objective with Adam; interruptible and resumable.
+    """Minimises an objective with Adam, and `Muon` for groups of matrices; interruptible and resumable.
 
     Args:
         objective: what is minimised.
@@ -177,11 +220,12 @@ class Trainer(Generic[O]):
         amsgrad: bool = False,
     ) -> None:
         self.objective, self.stage, self.steps, self.seconds, self.clip = objective, stage, steps, seconds, clip
-        groups = [list(group.parameters) for group in objective.groups]
-        self.trained = [parameter for group in groups for parameter in group]
-        self.adam = torch.optim.Adam(
-            [{"params": group} for group in groups], betas=betas, eps=eps, amsgrad=amsgrad, fused=True
-        )
+        self.trained = [parameter for group in objective.groups for parameter in group.parameters]
+        kinds: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
+        for group in objective.groups:
+            kinds[group.matrices].append({"params": list(group.parameters), "rate": group.rate})
+        self.adam = torch.optim.Adam(kinds[False], betas=betas, eps=eps, amsgrad=amsgrad, fused=True)
+        self.optimisers: list[torch.optim.Optimizer] = [self.adam, *([Muon(kinds[True])] if kinds[True] else [])]
         self.step, self.elapsed = 0, 0.0
         self.losses: dict[str, float] = {}
         self._name = f"{network_name}."
@@ -223,7 +267,7 @@ class Trainer(Generic[O]):
         device = self.trained[0].device
         if self.fraction < 1:
             report(self.progress)  # so that displays know when it began
-        while self.fraction < 1 and not self.objective.hopeless:
+        while self.fraction < 1 and not self.objective.settled:
             if flag.requested:
                 save()
                 return False
@@ -242,27 +286,31 @@ class Trainer(Generic[O]):
 
     def _step(self) -> dict[str, Tensor]:
         done = self.fraction
-        for group, (_, rate) in zip(self.adam.param_groups, self.objective.groups, strict=True):
-            group["lr"] = rate(done)
+        for optimiser in self.optimisers:
+            for group in optimiser.param_groups:
+                group["lr"] = group["rate"](done)
         terms, total = self.objective.losses(self.step, done)
         self.descend(total)
         self.step += 1
         return {name: term.detach() for name, term in terms.items()}
 
     def descend(self, total: Tensor) -> None:
-        """One step of Adam down the gradient of ``total``."""
-        self.adam.zero_grad(set_to_none=True)
+        """One step down the gradient of ``total``."""
+        for optimiser in self.optimisers:
+            optimiser.zero_grad(set_to_none=True)
         total.backward()
         if self.clip is not None:
             nn.utils.clip_grad_norm_(self.trained, self.clip)
-        self.adam.step()
+        for optimiser in self.optimisers:
+            optimiser.step()
 
     def state(self) -> dict[str, Tensor]:
         """All that `restore` needs to continue as if nothing had happened."""
         objective = self.objective
         state = _prefixed(self._name, objective.network.state_dict())
         for index, parameter in enumerate(objective.network.parameters()):
-            state |= _prefixed(f"adam.{index}.", self.adam.state.get(parameter, {}))
+            for optimiser in self.optimisers:
+                state |= _prefixed(f"adam.{index}.", optimiser.state.get(parameter, {}))
         state["generator"] = objective.generator.get_state()
         state["progress"] = torch.tensor([self.step, self.elapsed], dtype=torch.float64)
         return state | objective.kept
@@ -275,7 +323,8 @@ class Trainer(Generic[O]):
             # Adam counts its steps on the CPU, or beside the parameter where the kernel is fused.
             moments = without_prefix(f"adam.{index}.", state)
             if moments:
-                self.adam.state[parameter] = {name: tensor.to(parameter.device) for name, tensor in moments.items()}
+                owner = self.optimisers["momentum" in moments]
+                owner.state[parameter] = {name: tensor.to(parameter.device) for name, tensor in moments.items()}
         objective.generator.set_state(state["generator"].cpu())
         # What an older version did not keep begins anew.
         objective.kept = {name: state.get(name, tensor).to(tensor) for name, tensor in objective.kept.items()}

@@ -96,7 +96,7 @@ def test_a_fit_turns_what_its_first_level_contradicts(monkeypatch: pytest.Monkey
 
     counts: list[int] = []
     monkeypatch.setattr("mplicits.pipelines.fit.train.prepare", spoilt)
-    run = fit(PointCloud(raw.points), SMALL)
+    run = fit(PointCloud(raw.points), replace(SMALL, turn=0.0))  # slow learning averages over the patch
     review = run.record["stages"][0]["review"]
     assert counts[0] > 40
     assert abs(review["turned_normals"] - counts[0]) <= 0.1 * counts[0]
