@@ -192,10 +192,10 @@ class Verdict(NamedTuple):
         distance to points that smoothing has rounded off, the angle to normals of vertices, which are means of those of
         faces. Estimated normals share the noise of the points: with them the distance may not be significantly more.
         The noise of points that were set apart is independent of the level: f² there falls where the surface comes
-        nearer to the truth, and no significance is needed.
+        nearer to the truth. Only earlier weights need significance, as the best of several looks falls by chance.
         """
         if self.noisy:
-            return self.after.loss < self.before.loss
+            return self.after.loss < self.before.loss and (self.at == 1 or self.fall.distance > JUDGE.surely)
         sound = self.fall.distance > -JUDGE.surely if self.guessed else self.after.loss < self.before.loss
         return (max(self.fall) > JUDGE.surely and sound) or self.learns
 

@@ -30,7 +30,8 @@ class OutlierOptions:
     block: int = 1 << 16  # points handled at once, to bound memory
     rounds: int = 4  # most rounds, as dropped points may have been each other's neighbours
     sparser: float = 2.5  # reach over that of the neighbours; 1 in 1,000 of clean points
-    sparse: float = 4.0  # reach over the median; 1 in 30,000
+    sparse: float = 4.0  # reach over the usual one; 1 in 30,000
+    uneven: float = 1.6  # 85 % quantile of the reach over the median, above which it decides what is usual
     elevation: float = 0.6  # sine of the edge over a supporting neighbour's plane; 0.58 at the corners of a cube
     mirrored: float = 0.5  # cosine of the mirrored normals of a supporting neighbour
     lonely: float = 4.0  # times sparser, from which on the next two hold
@@ -166,7 +167,9 @@ def _isolated(cloud: _Cloud, factor: float) -> Mask:
 
 
 def _outliers(cloud: _Cloud) -> Mask:
-    before, usual = cloud.kept.copy(), float(np.median(cloud.reach[cloud.kept]))
+    before = cloud.kept.copy()
+    usual, large = np.quantile(cloud.reach[before], (0.5, 0.85))
+    usual = max(usual, large / OUTLIERS.uneven)
     support = np.ones(len(before))
     rows = np.flatnonzero(before)
     for _ in range(OUTLIERS.rounds):

@@ -51,6 +51,15 @@ def test_a_clean_cloud_loses_nothing(shape):
     assert found.flipped.mean() <= (0.03 if "thinner" in shape else 0)
 
 
+def test_the_sparse_part_of_a_thin_plate_is_kept_without_normals():
+    """Its points are as far from each other as its two sides, so that no plane fits them."""
+    plate = sample_surface(Box(half_size=(0.7, 0.5, 0.02)), 60_000, shell=0.001).points
+    points = plate[(np.abs(plate[:, 0]) > 0.65) | (np.random.default_rng(0).random(60_000) < 0.04)]
+    found = inspect_points(points, None, isolation=30.0)
+    assert not found.isolated.any()
+    assert not found.outliers.any()
+
+
 @pytest.mark.parametrize("fraction", [0.001, 0.01, 0.05])
 @pytest.mark.parametrize("given", [True, False])
 def test_strays_are_found_but_for_those_that_touch_the_surface(fraction, given):
