@@ -192,10 +192,10 @@ class Verdict(NamedTuple):
         distance to points that smoothing has rounded off, the angle to normals of vertices, which are means of those of
         faces. Estimated normals share the noise of the points: with them the distance may not be significantly more.
         The noise of points that were set apart is independent of the level: f² there falls where the surface comes
-        nearer to the truth. Only earlier weights need significance, as the best of several looks falls by chance.
+        nearer to the truth. The last weights are judged there, as the best of several looks would fall by chance.
         """
         if self.noisy:
-            return self.after.loss < self.before.loss and (self.at == 1 or self.fall.distance > JUDGE.surely)
+            return self.after.loss < self.before.loss
         sound = self.fall.distance > -JUDGE.surely if self.guessed else self.after.loss < self.before.loss
         return (max(self.fall) > JUDGE.surely and sound) or self.learns
 
@@ -382,7 +382,7 @@ class LevelObjective(Objective):
 
     @torch.no_grad()
     def look(self, done: float) -> None:
-        """Average the weights; at times judge their mean, and keep it if its score is the least so far."""
+        """Average the weights; at times judge their mean, and keep it if its score is the least, or points are noisy."""
         if self.judge is None:
             return
         share = 1 - math.exp((float(self.kept["averaged"]) - done) / JUDGE.averaged)
@@ -393,7 +393,7 @@ class LevelObjective(Objective):
             return
         self.kept["looks"].fill_(int(done * JUDGE.looks))
         score = self.judge.score(self.judge.errors(self._with(MEAN)).mean())
-        if score < float(self.kept["least"]):
+        if score < float(self.kept["least"]) or self.judge.noisy:
             self.kept["least"].fill_(score)
             self.kept["at"].fill_(done)
             for name in self.siren.state_dict():
