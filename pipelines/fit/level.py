@@ -382,7 +382,7 @@ class LevelObjective(Objective):
 
     @torch.no_grad()
     def look(self, done: float) -> None:
-        """Average the weights; at times judge their mean, and keep it if its score is the least, or points are noisy."""
+        """Average the weights; at times judge their mean, and keep it if its score is the least or points are noisy."""
         if self.judge is None:
             return
         share = 1 - math.exp((float(self.kept["averaged"]) - done) / JUDGE.averaged)

@@ -282,7 +282,7 @@ class FitConfig(TrainingSettings):
     omegas: tuple[float, ...] = _per_level((30.0, 80.0, 160.0), "SIREN frequency of each level (Eq. 2)")
     steps: tuple[int, ...] = _per_level((700, 400, 300), "training steps, one number per level")
     learning_rates: tuple[float, ...] = _per_level((4e-3, 2.5e-4, 1e-4), "peak learning rate of each level")
-    turn: float = setting(0.4, "peak change of hidden phases in a step, radians; 0: Adam trains all", at_least=0)
+    turn: float = setting(0.25, "peak change of hidden phases in a step, radians; 0: Adam trains all", at_least=0)
     batch: int = setting(8192, "samples per training step", above=0)
     levels: int | None = setting(None, "train only this many levels, coarse to fine")
     data_weight: float = setting(1e4, "level 0: weight of (f(x) - d)^2, the distance d known (Eq. 4)", at_least=0)
