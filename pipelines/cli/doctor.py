@@ -172,7 +172,7 @@ def _kernels() -> Finding:
 def _speed() -> Finding:
     rate = sgemm_rate(256, repeats=100) / 1e9
     text = f"{rate:.0f} GFLOP/s in float32 matrix products of 2048 × 256 × 256"
-    if rate < 15:  # the three minutes of the default preset become more than ten
+    if rate < 15:  # the two minutes of the default preset become more than ten
         return Finding("warning", "speed", f"{text}: slow, so start with --preset fast; is the machine busy?")
     return Finding("ok", "speed", text)
 

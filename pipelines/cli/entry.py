@@ -30,7 +30,7 @@ commands:
 
 examples:
   mplicits sample -o scan.ply                       write the bundled scan of a statue
-  mplicits fit scan.ply -o runs/statue              fit it (about three minutes on two cores)
+  mplicits fit scan.ply -o runs/statue              fit it (under two minutes on two cores)
   mplicits render runs/statue -o statue.png --up z  draw it; turntable.mp4 goes around it
   mplicits mesh runs/statue -o statue.ply --resolution 512
   mplicits evaluate statue.ply reference.ply
