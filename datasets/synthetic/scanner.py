@@ -68,16 +68,22 @@ class ScanFaults:
             raise ValueError(f"uneven={self.uneven}: expected a factor of 1 or more")
 
 
-def statue_scan(*, noise: float = STATUE_NOISE, **options: Any) -> PointCloud:
+def statue_scan(
+    *,
+    noise: float = STATUE_NOISE,
+    faults: ScanFaults | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> PointCloud:
     """Scan the :class:`Statue` from twelve places: the bundled sample, some 100,000 points in millimetres.
 
     Points are 1.6 mm apart, with a tenth of a millimetre of range noise, as of hand-held structured-light scanners. The
     bottom of the statue is not scanned. ``STATUE_PLACEMENT.to_unit(points)`` has the coordinates of the field
-    ``Statue()``. The arguments are those of `scan_with_truth`: ``noise``, ``faults``, ``seed`` and ``progress``.
+    ``Statue()``. The arguments are those of `scan_with_truth`.
     """
     statue = Statue()
     about = {"scanners": 12, "colors": statue.colors, "placement": STATUE_PLACEMENT}
-    return simulate_scan(statue, noise=noise, **about, **options)
+    return simulate_scan(statue, noise=noise, faults=faults, seed=seed, progress=progress, **about)
 
 
 def simulate_scan(field: Field, **options: Any) -> PointCloud:

@@ -181,13 +181,18 @@ class CloudDistance:
 
     def nearest(self, x: NDArray[np.floating]) -> NDArray[np.float64]:
         """Distance ``(M,)`` from each of ``(M, 3)`` to the nearest point of the cloud."""
-        return self.nearest_gap(x)[0]
+        return self.nearest_rows(x)[0]
 
     def nearest_gap(self, x: NDArray[np.floating]) -> tuple[NDArray[np.float64], Float32]:
         """Distance ``(M,)`` from each of ``(M, 3)`` to the nearest point, and the spacing of the cloud's own there."""
-        parts = [self._query(part, 1) for part in _parts(x, self.options.rows)]
-        distance, index = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return distance, self.gaps[index]
+        distance, rows = self.nearest_rows(x)
+        return distance, self.gaps[rows]
+
+    def nearest_rows(self, x: NDArray[np.floating], k: int = 1) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
+        """Distances from each of ``(M, 3)`` to the ``k`` nearest points and their rows: ``(M,)``, or ``(M, k)``."""
+        found = [self.tree.query(part, k=k, workers=-1) for part in _parts(x, self.options.rows)]
+        distance, rows = (np.concatenate(part) for part in zip(*found, strict=True))
+        return distance, rows
 
     def signed(self, x: Tensor, *, soft: float = CLOUD.soft) -> Tensor:
         """Signed distance ``(M,)`` of ``(M, 3)`` points on the CPU, negative inside.
@@ -195,8 +200,7 @@ class CloudDistance:
         Dipoles are softened by ``soft`` standard deviations of the noise, see `winding_number`.
         """
         query = x.cpu().numpy()
-        parts = [self._query(part, self.neighbors) for part in _parts(query, self.options.rows)]
-        distance, index = (np.concatenate(part) for part in zip(*parts, strict=True))
+        distance, index = self.nearest_rows(query, self.neighbors)
         offset = query[:, None] - self.points[index]  # (M, k, 3)
         along = np.einsum("mkd,mkd->mk", offset, self.normals[index])
         across = np.sqrt(np.maximum(distance**2 - along**2, 0))
@@ -219,11 +223,6 @@ class CloudDistance:
         )
         side[far] = np.where(rim, side[far], number)
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
-
-    def _query(self, x: NDArray[np.floating], k: int) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
-        """Distances to the k nearest points, and their indices."""
-        distance, index = self.tree.query(x, k=k, workers=-1)
-        return np.asarray(distance), np.asarray(index)
 
     def winding_number(self, x: Float32, *, soft: float = CLOUD.soft) -> NDArray[np.float64]:
         """Generalised winding number ``(M,)``: about 1 inside, 0 outside, in between near holes.

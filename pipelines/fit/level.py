@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from ...neural_fields import Field, Siren
 from ...neural_fields.backend.devices import upload
 from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
 from ..training.settings import EvolveConfig, FitConfig
-from ..training.trainer import Group, Objective, seeded, warm_cosine
+from ..training.trainer import Group, Objective, seeded, warm_cosine, without_prefix
 from .cloud import drawn
 from .samples import LEAST, SQUARES, RobustScales, Samples, Source, with_previous
 
@@ -71,16 +71,15 @@ def calm_omega(config: FitConfig, level: int, noise: float, options: LevelOption
 def siren_groups(siren: Siren, rate: float, turn: float) -> list[Group]:
     """Parameters of a SIREN for a `Trainer`: hidden matrices by Muon at the peak rate ``turn`` / ω, others by Adam.
 
-    The norm of the change of a hidden layer's phases in a step is then at most about ``turn`` times that of its input,
-    whatever the frequency and the width: ``turn`` radians where all inputs are 1. ``rate`` is Adam's peak rate. Without
-    ``turn``, all are trained by Adam.
+    In a step, the norm of the change of a hidden layer's phases is then at most about ``turn`` times that of its input.
+    Frequency and width do not matter; where all inputs are 1, that is ``turn`` radians. ``rate`` is Adam's peak rate.
+    Without ``turn``, all are trained by Adam.
     """
     names = {f"layers.{layer}.weight" for layer in range(1, siren.depth)} if turn else set()
-    groups: dict[bool, list[nn.Parameter]] = {False: [], True: []}
-    for name, parameter in siren.named_parameters():
-        groups[name in names].append(parameter)
-    hidden = [Group(groups[True], warm_cosine(turn / siren.omega), matrices=True)] if names else []
-    return [Group(groups[False], warm_cosine(rate)), *hidden]
+    hidden = [parameter for name, parameter in siren.named_parameters() if name in names]
+    others = [parameter for name, parameter in siren.named_parameters() if name not in names]
+    groups = [Group(others, warm_cosine(rate))]
+    return [*groups, Group(hidden, warm_cosine(turn / siren.omega), matrices=True)] if hidden else groups
 
 
 @dataclass(frozen=True)
@@ -392,12 +391,14 @@ class LevelObjective(Objective):
         if int(done * JUDGE.looks) <= int(self.kept["looks"]):
             return
         self.kept["looks"].fill_(int(done * JUDGE.looks))
-        score = self.judge.score(self.judge.errors(self._with(MEAN)).mean())
+        mean = copy.deepcopy(self.siren)
+        mean.load_state_dict(without_prefix(MEAN, self.kept))
+        score = self.judge.score(self.judge.errors(mean).mean())
         if score < float(self.kept["least"]) or self.judge.noisy:
             self.kept["least"].fill_(score)
             self.kept["at"].fill_(done)
-            for name in self.siren.state_dict():
-                self.kept[BEST + name].copy_(self.kept[MEAN + name])
+            for name, weights in without_prefix(MEAN, self.kept).items():
+                self.kept[BEST + name].copy_(weights)
 
     @property
     def settled(self) -> bool:
@@ -414,14 +415,8 @@ class LevelObjective(Objective):
             return None
         if not self.settled:
             self.look(1.0)
-        self.siren.load_state_dict(self._with(BEST).state_dict())
+        self.siren.load_state_dict(without_prefix(BEST, self.kept))
         return self.judge.verdict(self.judge.errors(self.siren), float(self.kept["at"]))
-
-    def _with(self, prefix: str) -> Siren:
-        """The level with those of the kept weights."""
-        siren = copy.deepcopy(self.siren)
-        siren.load_state_dict({name: self.kept[prefix + name] for name in siren.state_dict()})
-        return siren
 
     def _draw(self, source: Source, shares: Tensor | None) -> Tensor:
         if shares is None:

@@ -379,16 +379,16 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
     def judge(self, delta: float, surface: Source) -> Judge | None:
         """The judge of a residual level, with its loss weights on the surface; None without enough held-out points."""
         index, noisy = self.indexed(len(self.stages)), self.cloud.noisy
-        points, normals = self.points[self.held], self.normals[self.held]
-        terms: dict[str, Any] = {"data": surface.data, "normal": surface.normal, "scales": surface.scales}
-        if noisy is not None:
-            points = torch.from_numpy(noisy)
-            normals = torch.from_numpy(index.normals[index.tree.query(noisy)[1]])
-            terms = {"data": 1.0, "normal": 0.0, "noisy": True}
+        points = self.points[self.held] if noisy is None else torch.from_numpy(noisy)
         if not len(points):
             return None
         assert self.frozen is not None
-        areas = torch.from_numpy(index.nearest_gap(points.numpy())[1]) ** 2
+        rows = index.nearest_rows(points.numpy())[1]
+        areas, normals = torch.from_numpy(index.gaps[rows]) ** 2, self.normals[self.held]
+        terms: dict[str, Any] = {"data": surface.data, "normal": surface.normal, "scales": surface.scales}
+        if noisy is not None:
+            normals = torch.from_numpy(index.normals[rows])
+            terms = {"data": 1.0, "normal": 0.0, "noisy": True}
         about = {"spacing": self.spacing, "areas": areas, "guessed": self.cloud.estimated}
         judge = Judge(points, normals, self.frozen, delta, **about, **terms)
         return judge if judge.count >= JUDGE.fewest / 2 else None

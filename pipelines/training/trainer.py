@@ -221,11 +221,13 @@ class Trainer(Generic[O]):
     ) -> None:
         self.objective, self.stage, self.steps, self.seconds, self.clip = objective, stage, steps, seconds, clip
         self.trained = [parameter for group in objective.groups for parameter in group.parameters]
-        kinds: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
-        for group in objective.groups:
-            kinds[group.matrices].append({"params": list(group.parameters), "rate": group.rate})
-        self.adam = torch.optim.Adam(kinds[False], betas=betas, eps=eps, amsgrad=amsgrad, fused=True)
-        self.optimisers: list[torch.optim.Optimizer] = [self.adam, *([Muon(kinds[True])] if kinds[True] else [])]
+        groups = [{"params": list(group.parameters), "rate": group.rate} for group in objective.groups]
+        matrices = [group for group, given in zip(groups, objective.groups, strict=True) if given.matrices]
+        others = [group for group, given in zip(groups, objective.groups, strict=True) if not given.matrices]
+        self.adam = torch.optim.Adam(others, betas=betas, eps=eps, amsgrad=amsgrad, fused=True)
+        self.optimisers: dict[str, torch.optim.Optimizer] = {"adam": self.adam}  # by their names in `state`
+        if matrices:
+            self.optimisers["muon"] = Muon(matrices)
         self.step, self.elapsed = 0, 0.0
         self.losses: dict[str, float] = {}
         self._name = f"{network_name}."
@@ -286,7 +288,7 @@ class Trainer(Generic[O]):
 
     def _step(self) -> dict[str, Tensor]:
         done = self.fraction
-        for optimiser in self.optimisers:
+        for optimiser in self.optimisers.values():
             for group in optimiser.param_groups:
                 group["lr"] = group["rate"](done)
         terms, total = self.objective.losses(self.step, done)
@@ -296,12 +298,12 @@ class Trainer(Generic[O]):
 
     def descend(self, total: Tensor) -> None:
         """One step down the gradient of ``total``."""
-        for optimiser in self.optimisers:
+        for optimiser in self.optimisers.values():
             optimiser.zero_grad(set_to_none=True)
         total.backward()
         if self.clip is not None:
             nn.utils.clip_grad_norm_(self.trained, self.clip)
-        for optimiser in self.optimisers:
+        for optimiser in self.optimisers.values():
             optimiser.step()
 
     def state(self) -> dict[str, Tensor]:
@@ -309,8 +311,8 @@ class Trainer(Generic[O]):
         objective = self.objective
         state = _prefixed(self._name, objective.network.state_dict())
         for index, parameter in enumerate(objective.network.parameters()):
-            for optimiser in self.optimisers:
-                state |= _prefixed(f"adam.{index}.", optimiser.state.get(parameter, {}))
+            for name, optimiser in self.optimisers.items():
+                state |= _prefixed(f"{name}.{index}.", optimiser.state.get(parameter, {}))
         state["generator"] = objective.generator.get_state()
         state["progress"] = torch.tensor([self.step, self.elapsed], dtype=torch.float64)
         return state | objective.kept
@@ -320,11 +322,11 @@ class Trainer(Generic[O]):
         objective = self.objective
         objective.network.load_state_dict(without_prefix(self._name, state))
         for index, parameter in enumerate(objective.network.parameters()):
-            # Adam counts its steps on the CPU, or beside the parameter where the kernel is fused.
-            moments = without_prefix(f"adam.{index}.", state)
-            if moments:
-                owner = self.optimisers["momentum" in moments]
-                owner.state[parameter] = {name: tensor.to(parameter.device) for name, tensor in moments.items()}
+            for name, optimiser in self.optimisers.items():
+                # Adam counts its steps on the CPU, or beside the parameter where the kernel is fused.
+                moments = without_prefix(f"{name}.{index}.", state)
+                if moments:
+                    optimiser.state[parameter] = {key: tensor.to(parameter.device) for key, tensor in moments.items()}
         objective.generator.set_state(state["generator"].cpu())
         # What an older version did not keep begins anew.
         objective.kept = {name: state.get(name, tensor).to(tensor) for name, tensor in objective.kept.items()}

@@ -231,8 +231,10 @@ def march_bands(
 def march_fused(asked: March) -> None:
     """`march_rays` for one network that leaves registers for rays, `march_levels` for all others."""
     networks = asked.levels.networks
-    alone = len(networks) == 1 and networks[0].shape.width <= tracing.IN_REGISTERS
-    (tracing.march_rays if alone else march_levels)(asked)
+    if len(networks) == 1 and networks[0].shape.width <= tracing.IN_REGISTERS:
+        tracing.march_rays(asked)
+    else:
+        march_levels(asked)
 
 
 def march_levels(asked: March) -> None:
