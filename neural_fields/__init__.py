@@ -43,7 +43,7 @@ _MOVED = {
     "meshing.extract": "map_normals",
     "networks.colors": "ColorSiren Outside=BackgroundField Radiance ViewColor=ColorNetwork",
     "networks.encoded": "EncodedField",
-    "networks.multiscale": "levels_of solve_sphere",
+    "networks.multiscale": "levels_of",
     "shape": "Closest WorldHits in_one_frame",
     "spacetime.evolution": "Law curvature key_loss law_loss mean_curvature morph near_surface normal_speed transport",
     "spacetime.field": "SpaceTimeJet spacetime_jet",

@@ -22,7 +22,7 @@ from mplicits.datasets.clouds.cleaning.prepare import prepare_cloud
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_neus
 from mplicits.neural_fields.networks.colors import ColorNetwork
-from mplicits.neural_fields.networks.multiscale import fit_sphere, solve_sphere
+from mplicits.neural_fields.networks.multiscale import fit_sphere
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
 from mplicits.neural_fields.tracing.cones import cone_ends, cone_starts
 from mplicits.neural_fields.volume.render import Sampling
@@ -161,10 +161,9 @@ def in_input_units(device: torch.device) -> Result:
 
 
 def begun_as_spheres(device: torch.device) -> Result:
-    solved, trained = nf.Siren(32, 2, omega=10.0).to(device), nf.Siren(32, 2, omega=10.0).to(device)
-    solve_sphere(solved)
+    trained = nf.Siren(32, 2, omega=10.0).to(device)
     fit_sphere(trained, steps=3, batch=64)
-    return *tensors(solved), *tensors(trained)
+    return tensors(trained)
 
 
 CONSUMERS = (

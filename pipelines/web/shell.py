@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import Field, Jet, extract_mesh
+from ...neural_fields import Field, Union, extract_mesh
 from ...neural_fields.meshing.mesh import Mesh
 from ...neural_fields.spacetime.field import SpaceTimeSDF, at_time
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
@@ -28,23 +28,23 @@ GRID = 1023
 
 
 @torch.no_grad()
-def shell_mesh(field: Field, *, cells: int = CELLS) -> Mesh:
-    """The surface f_0 = δ_0 + `ROOM` cells, closed by a ball a little larger than that in which rays are traced.
+def shell_mesh(field: Field, *, slack: float = 0.0) -> Mesh:
+    """The surface f_0 = δ_0 + ``slack`` + `ROOM` cells, closed by a ball a little larger than that of the rays.
 
     δ_0 is 0 for a field of one level. Raises a NoSurfaceError if level 0 has no such surface.
     """
     delta = float(field.deltas[0]) if field.num_levels > 1 else 0.0
-    half = BOUNDING_RADIUS * (1 + 6 / cells)
-    step = 2 * half / cells
+    half = BOUNDING_RADIUS * (1 + 6 / CELLS)
+    step = 2 * half / CELLS
     radius = half - 1.5 * step
 
     def outside(x: Tensor) -> Tensor:
         # The ball is flatter than a cell is wide, so its chords stay outside the smaller ball of the rays.
-        return torch.maximum(field.value(x, level=0) - delta - ROOM * step, x.norm(dim=-1) - radius)
+        return torch.maximum(field.value(x, level=0) - delta - slack - ROOM * step, x.norm(dim=-1) - radius)
 
     assert radius * math.cos(step / radius) > BOUNDING_RADIUS
     corner = (half, half, half)
-    mesh = extract_mesh(outside, resolution=cells, bounds=((-half, -half, -half), corner), normals=False)
+    mesh = extract_mesh(outside, resolution=CELLS, bounds=((-half, -half, -half), corner), normals=False)
     return Mesh(np.asarray(mesh.vertices), mesh.faces)
 
 
@@ -72,42 +72,6 @@ LATTICE, TIMES = 24, 9  # along the box and in time: where changes are measured
 CELL = 2 * BOUNDING_RADIUS / CELLS
 
 
-class Swept(Field):
-    """The least value of all moments of a field that moves, less what may lie between them.
-
-    With moments t_k, f(x) = min_k f(x, t_k) − ½ Δt s ≤ f(x, t) at any t, if no value changes faster than s = ``speed``
-    (see `fastest_change`). There are as many moments as make ½ Δt s at most half a cell of the mesh, and at most 65.
-    """
-
-    def __init__(self, field: SpaceTimeSDF, speed: float) -> None:
-        super().__init__()
-        count = min(65, 2 + math.floor(speed / CELL))
-        self.in_dim, self.num_levels = 3, field.num_levels
-        self.stills = torch.nn.ModuleList(field.at(float(t)) for t in np.linspace(0, 1, count))
-        self.margin = 0.5 * speed / (count - 1)
-
-    @property
-    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands, those of every moment."""
-        return self._stills()[0].deltas
-
-    def _stills(self) -> list[Field]:
-        return [still for still in self.stills if isinstance(still, Field)]
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        """See `Field.value`."""
-        values = [still.value(x, level=level) for still in self._stills()]
-        return torch.stack(values).amin(dim=0) - self.margin
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        """See `Field.jet`; the gradient is that of the moment with the least value."""
-        jets = [still.jet(x, level=level) for still in self._stills()]
-        value, first = torch.stack([jet.value for jet in jets]).min(dim=0)
-        gradients = torch.stack([jet.gradient for jet in jets])
-        places = first[None, ..., None].expand(1, *gradients.shape[1:])
-        return Jet(value - self.margin, gradients.gather(0, places)[0], jets[0].features)
-
-
 @torch.no_grad()
 def fastest_change(field: SpaceTimeSDF) -> float:
     """The greatest |∂f_0/∂t| near level 0's band, at `LATTICE`³ places and `TIMES` times: measured, not a bound."""
@@ -126,5 +90,12 @@ def fastest_change(field: SpaceTimeSDF) -> float:
 
 
 def swept_shell(field: SpaceTimeSDF) -> Mesh:
-    """A mesh around the bands of all moments (`shell_mesh` of `Swept`); raises NoSurfaceError."""
-    return shell_mesh(Swept(field, fastest_change(field)).requires_grad_(False))
+    """A mesh around the bands of all moments: `shell_mesh` of the union of some; raises NoSurfaceError.
+
+    With moments t_k, min_k f(x, t_k) − ½ Δt s ≤ f(x, t) at any t, if no value changes faster than s (`fastest_change`).
+    There are as many moments as make ½ Δt s at most half a cell of the mesh, and at most 65.
+    """
+    speed = fastest_change(field)
+    count = min(65, 2 + math.floor(speed / CELL))
+    stills = [field.at(float(t)) for t in np.linspace(0, 1, count)]
+    return shell_mesh(Union(*stills), slack=0.5 * speed / (count - 1))

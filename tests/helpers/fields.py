@@ -9,6 +9,7 @@ from mplicits.neural_fields.fields.field import SecondJet
 from mplicits.neural_fields.networks.encoded import EncodedField
 from mplicits.neural_fields.networks.grids import HashEncoding
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
+from mplicits.neural_fields.networks.siren import Siren, forward
 from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
 from mplicits.neural_fields.tracing.sphere import Hits
@@ -167,3 +168,31 @@ FIELDS: dict[str, Callable[[], nf.Field]] = {
 }
 # Signed distances everywhere, not only signs.
 EXACT = {name: FIELDS[name] for name in ("sphere", "plane", "torus", "box", "capsule", "slice-of-moving")}
+
+
+@torch.no_grad()
+def solve_sphere(network: Siren, radius: float = 0.5) -> None:
+    """A SIREN of units 1 becomes |x| − radius on the unit ball by one linear solve, and no random numbers.
+
+    The first layer is scaled to low phases. The output's weights w and bias b minimise the sum over n points of
+    (w·h(x) + b − |x| + r)² + 0.1 |Jᵀw − x / |x||², and 1e-6 n |w|²: h are the last sines, J is their Jacobian. At
+    (128, 4) and ω₀ = 10 the values are off by 0.01 and the slopes by 0.1.
+    """
+    first, width, generator = network.layers[0], network.width, torch.Generator().manual_seed(0)
+    first.weight.mul_(1.7 / (3**0.5 * network.omega) / first.weight.double().square().mean().sqrt())
+    direction = torch.randn(8 * (width + 1), network.in_dim, generator=generator, dtype=torch.float64)
+    direction = torch.nn.functional.normalize(direction, dim=1)
+    lengths = 1.05 * torch.rand(len(direction), 1, generator=generator, dtype=torch.float64).sqrt()
+    direction, lengths = direction.to(first.weight.device), lengths.to(first.weight.device)
+    parameters = network.folded()
+    _, sines, phases = forward((direction * lengths).to(first.weight), parameters)
+    tangents = torch.eye(network.in_dim).to(first.weight)[:, None]
+    for weight, phase in zip(parameters[0:-2:2], phases, strict=True):
+        tangents = (tangents @ weight.t()) * phase.cos()
+    slopes = torch.nn.functional.pad(tangents.double(), (0, 1))  # of the bias: 0
+    rows = torch.cat((torch.nn.functional.pad(sines[-1].double(), (0, 1), value=1.0), *0.1**0.5 * slopes))
+    target = torch.cat((lengths[:, 0] - radius, *(0.1**0.5 * direction.t())))
+    damping = torch.full((width + 1,), 1e-6 * len(lengths), dtype=rows.dtype, device=rows.device)
+    damping[-1] = 0  # the bias is not damped
+    solved = torch.linalg.solve(rows.t() @ rows + damping.diag(), rows.t() @ target).to(first.weight)
+    network.output.weight[0], network.output.bias[0] = solved[:-1], solved[-1]

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from fields import solve_sphere
 from mplicits.neural_fields import MultiscaleSDF, Siren, TextureField, sphere_trace
 from mplicits.neural_fields.networks.colors import ColorSiren
-from mplicits.neural_fields.networks.multiscale import solve_sphere
 
 PATIENCE = 60.0
 TITLE = "<img src=x onerror=alert(1)> & ball"

@@ -8,10 +8,10 @@ from functools import partial
 
 import pytest
 import torch
+from fields import solve_sphere
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImage, PosedImages
 from mplicits.neural_fields import Jet, Sphere
-from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct import train as reconstruct_texture

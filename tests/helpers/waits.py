@@ -16,13 +16,13 @@ from unittest import mock
 
 import fake_accelerator
 import torch
+from fields import solve_sphere
 from mplicits.datasets import sample_torus, write_cloud_ply
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_neus
 from mplicits.neural_fields import Field, MultiscaleSDF, sphere_trace
 from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
-from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.cli.entry import main as command
 from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.training.trainer import Trainer

@@ -13,7 +13,6 @@ from mplicits.neural_fields.hosts.learning_rates import parameter_groups, rescal
 from mplicits.neural_fields.networks.colors import ColorSiren
 from mplicits.neural_fields.networks.encoded import EncodedField
 from mplicits.neural_fields.networks.grids import HashEncoding, ValueGrid
-from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.neural_fields.shape import in_one_frame
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
@@ -60,7 +59,6 @@ REFUSED: list[tuple[Callable[[], object], str]] = [
     (lambda: nf.MultiscaleSDF(BALL, [nf.Siren(4, 1, in_dim=4)], [0.1]), r"residuals\[0\].in_dim=4"),
     (lambda: nf.MultiscaleSDF.from_widths([(8, 1), (8, 1)], omegas=[30]), "omegas has 1 entries"),
     (lambda: nf.fit_sphere(nf.Siren(8, 1), 0.0), "radius=0.0"),
-    (lambda: solve_sphere(nf.Siren(8, 1), -1.0), "radius=-1.0"),
     (lambda: EncodedField(nf.Siren(8, 1, in_dim=4)), "in_dim=4"),
     (lambda: EncodedField(NETWORK, gain=0), "gain=0"),
     (lambda: HashEncoding(table_size=100), "table_size=100"),

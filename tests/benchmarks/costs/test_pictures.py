@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from fields import solve_sphere
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import MultiscaleSDF, save_field
-from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.render.trace import pixel_size, trace_view
 
 from benchmarks.cli import main

@@ -8,8 +8,8 @@ from unittest import mock
 import mplicits.neural_fields.backend.kernels.cones as fused
 import pytest
 import torch
+from fields import solve_sphere
 from mplicits.neural_fields import MultiscaleSDF, Siren, sphere_trace
-from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.neural_fields.tracing.cones import cone_starts
 from torch import Tensor
 from torch.nn.functional import normalize

@@ -8,9 +8,9 @@ from unittest import mock
 import mplicits.neural_fields.tracing.picture as fused
 import pytest
 import torch
+from fields import solve_sphere
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.neural_fields import Field, MultiscaleSDF, Siren, Sphere
-from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.render.trace import PRECISION, Seen, pixel_size, trace_view
 
 

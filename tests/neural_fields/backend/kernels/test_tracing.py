@@ -10,8 +10,8 @@ import mplicits.neural_fields.backend.kernels.paths as banded
 import mplicits.neural_fields.backend.kernels.tracing as fused
 import pytest
 import torch
+from fields import solve_sphere
 from mplicits.neural_fields import MultiscaleSDF, Siren, sphere_trace
-from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.neural_fields.tracing.sphere import Hits
 from torch import Tensor
 from torch.nn.functional import normalize
