@@ -46,13 +46,16 @@ def reported(report: Report | None, stage: str) -> Iterator[None]:
 
 
 @contextmanager
-def progress_bars(*, clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
-    """Show a bar for each stage on stderr; where that is no terminal, print lines, see `Lines`."""
+def progress_bars(*, counting: bool = False, clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
+    """Show a bar for each stage on stderr; where that is no terminal, print lines, see `Lines`.
+
+    Bars of stages that are ``counting`` something go when they are done.
+    """
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield Lines(clock=clock)
+        yield Lines(counting=counting, clock=clock)
         return
-    with _StagesAndLosses(*_columns(), console=console, get_time=clock) as bars:
+    with _StagesAndLosses(*_columns(), console=console, transient=counting, get_time=clock) as bars:
         shown = _Bars(bars)
         yield shown
         shown.end()
@@ -135,7 +138,8 @@ class _StagesAndLosses(Bars):
 
     def get_renderables(self) -> Iterator[RenderableType]:
         yield from super().get_renderables()
-        yield Text(self.losses, style="dim")
+        if self.losses:
+            yield Text(self.losses, style="dim")
 
 
 class _Bars:
@@ -148,12 +152,19 @@ class _Bars:
             self.end()
             self.stages[progress.stage] = self.bars.add_task(progress.stage, total=1.0, before=progress.fraction)
         self.bars.losses = _losses(progress)
-        _advance(self.bars, self.stages[progress.stage], progress.fraction)
+        self._advance(self.stages[progress.stage], progress.fraction)
 
     def end(self) -> None:
         """All stages so far are done."""
         for task in self.stages.values():
             self.bars.update(task, total=1.0, completed=1.0)
+
+    def _advance(self, task: TaskID, fraction: float) -> None:
+        """Show how much of a stage is done, and how long the rest takes at that pace; a pulse before anything is."""
+        shown = self.bars.tasks[self.bars.task_ids.index(task)]
+        left = seconds_left(shown.elapsed or 0.0, shown.fields["before"], fraction)
+        shown.total = 1.0 if fraction else None  # `update` cannot take a total away
+        self.bars.update(task, completed=fraction, left=left, at=self.bars.get_time())
 
 
 def _losses(progress: Progress) -> str:
@@ -163,22 +174,8 @@ def _losses(progress: Progress) -> str:
 @contextmanager
 def counter_bar(title: str, *, clock: Callable[[], float] = time.monotonic) -> Iterator[Callable[[int, int], None]]:
     """A bar with the time left on stderr, to be told ``(done, total)``; lines now and then where it is no terminal."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        lines = Lines(counting=True, clock=clock)
-        yield lambda done, total: lines(Progress(title, done, total, done / max(total, 1), {}))
-        return
-    with Bars(*_columns(), console=console, transient=True, get_time=clock) as bars:
-        task = bars.add_task(title, total=1.0)
-        yield lambda done, total: _advance(bars, task, done / max(total, 1))
-
-
-def _advance(bars: Bars, task: TaskID, fraction: float) -> None:
-    """Show how much of a stage is done, and how long the rest takes at that pace; a pulse before anything is."""
-    shown = bars.tasks[bars.task_ids.index(task)]
-    left = seconds_left(shown.elapsed or 0.0, shown.fields.get("before", 0.0), fraction)
-    shown.total = 1.0 if fraction else None  # `update` cannot take a total away
-    bars.update(task, completed=fraction, left=left, at=bars.get_time())
+    with progress_bars(counting=True, clock=clock) as report:
+        yield lambda done, total: report(Progress(title, done, total, done / max(total, 1), {}))
 
 
 @contextmanager
@@ -189,19 +186,15 @@ def tensorboard_log(directory: str | Path) -> Iterator[Report]:
         InputError: tensorboard is not installed, or the directory cannot be made.
     """
     writer = _writer(Path(directory))
+
+    def log(progress: Progress, /) -> None:
+        for name, value in progress.losses.items():
+            writer.add_scalar(f"{progress.stage}/{name}", value, progress.step)
+
     try:
-        yield _Log(writer)
+        yield log
     finally:
         writer.close()
-
-
-class _Log:
-    def __init__(self, writer: Any) -> None:
-        self.writer = writer
-
-    def __call__(self, progress: Progress, /) -> None:
-        for name, value in progress.losses.items():
-            self.writer.add_scalar(f"{progress.stage}/{name}", value, progress.step)
 
 
 def _writer(directory: Path) -> Any:
