@@ -92,21 +92,20 @@ def normal_speed(speed: SpeedField, *, extend: bool = False) -> Law:
     return Law(rate)
 
 
-def morph(guide: Field) -> Law:
+def morph(guide: Field, *, extend: bool = False) -> Law:
     """Level-set morphing: a guide g(x, t), not trained, sets the normal speed ``−∂g/∂t``, so ``∂f/∂t = |∇f| ∂g/∂t``.
 
     With `Keyframes` for the guide this is ``∂f/∂t = |∇f| (f_{k+1} − f_k) / (t_{k+1} − t_k)``: a point of the first
     shape moves outward where it is inside of the second. The law is the same when time runs backward. Novello et al.
     (and Breen and Whitaker 2001) take ``f_{k+1} − f``, which prefers one end; both are driven to their ends by
-    `key_loss`.
+    `key_loss`. For ``extend`` see `normal_speed`.
     """
 
-    def rate(jet: SpaceTimeJet) -> Tensor:
-        with torch.no_grad():
-            drive = guide.jet(at_time(jet.position, jet.time)).gradient[..., 3]
-        return drive * _length(jet.gradient)
+    @torch.no_grad()
+    def speed(x: Tensor, t: Tensor) -> Tensor:
+        return -guide.to(x.device).jet(at_time(x, t)).gradient[..., 3]
 
-    return Law(rate)
+    return normal_speed(speed, extend=extend)
 
 
 def mean_curvature(alpha: float, *, extend: bool = False, least: float = 0.1) -> Law:

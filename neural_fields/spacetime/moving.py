@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ..fields.field import Field, FieldLike, Jet, OneLevelField, Wrapper, as_field, solid
 
@@ -177,27 +178,39 @@ class Keyframes(OneLevelField):
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; a key is evaluated only where it has a weight."""
         self.resolve_level(level)
+        return self.blended(x, lambda index, rows: self.key(index).value(rows[:, :3]))
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`; between two keys ∂f/∂t = (f_{k+1} − f_k) / (t_{k+1} − t_k)."""
+
+        def still(index: int, rows: Tensor) -> tuple[Tensor, Tensor]:
+            value, gradient, _ = self.key(index).jet(rows[:, :3])
+            return value, pad(gradient, (0, 1))
+
+        self.resolve_level(level)
+        return self.blended_jet(x, still)
+
+    def blended(self, x: Tensor, value_of: Callable[[int, Tensor], Tensor]) -> Tensor:
+        """Σ_k w_k(t) f_k ``(...,)`` at ``x`` ``(..., 4)``; ``value_of(k, rows)`` has f_k of rows ``(N, 4)``."""
         rows = self.check_points(x).reshape(-1, 4)
         value = rows.new_zeros(len(rows))
         for index in range(len(self.times)):
             weight, _ = self.weight(index, rows[:, 3])
             heard = weight.nonzero()[:, 0]
-            part = weight[heard] * self.key(index).value(rows[heard, :3])
-            value = value.index_add(0, heard, part)
+            value = value.index_add(0, heard, weight[heard] * value_of(index, rows[heard]))
         return value.reshape(x.shape[:-1])
 
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        """See `Field.jet`; between two keys ∂f/∂t = (f_{k+1} − f_k) / (t_{k+1} − t_k)."""
-        self.resolve_level(level)
+    def blended_jet(self, x: Tensor, jet_of: Callable[[int, Tensor], tuple[Tensor, Tensor]]) -> Jet:
+        """The jet of `blended`; ``jet_of`` has f_k ``(N,)`` and its gradient ``(N, 4)``, of f_k alone."""
         rows = self.check_points(x).reshape(-1, 4)
         value, gradient = rows.new_zeros(len(rows)), torch.zeros_like(rows)
         for index in range(len(self.times)):
             weight, slope = self.weight(index, rows[:, 3])
             heard = ((weight != 0) | (slope != 0)).nonzero()[:, 0]
-            jet = self.key(index).jet(rows[heard, :3])
-            value = value.index_add(0, heard, weight[heard] * jet.value)
-            part = torch.cat((weight[heard, None] * jet.gradient, (slope[heard] * jet.value)[:, None]), dim=-1)
-            gradient = gradient.index_add(0, heard, part)
+            own, by_place = jet_of(index, rows[heard])
+            by_time = pad((slope[heard] * own)[:, None], (3, 0))
+            value = value.index_add(0, heard, weight[heard] * own)
+            gradient = gradient.index_add(0, heard, weight[heard, None] * by_place + by_time)
         return Jet(value.reshape(x.shape[:-1]), gradient.reshape(x.shape), x.new_empty((*x.shape[:-1], 0)))
 
     def weight(self, index: int, t: Tensor) -> tuple[Tensor, Tensor]:

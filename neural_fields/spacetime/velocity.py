@@ -76,35 +76,26 @@ class CarriedKeyframes(OneLevelField):
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; points are followed only to keys that have a weight."""
+
+        def carried(index: int, rows: Tensor) -> Tensor:
+            return self.keys.key(index).value(self.home(rows[:, :3], rows[:, 3], index))
+
         self.resolve_level(level)
-        rows = self.check_points(x).reshape(-1, 4)
-        value = rows.new_zeros(len(rows))
-        for index in range(len(self.keys.times)):
-            weight, _ = self.keys.weight(index, rows[:, 3])
-            heard = weight.nonzero()[:, 0]
-            home = self.home(rows[heard, :3], rows[heard, 3], index)
-            value = value.index_add(0, heard, weight[heard] * self.keys.key(index).value(home))
-        return value.reshape(x.shape[:-1])
+        return self.keys.blended(x, carried)
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; the derivatives of f_k∘φ are ∇f_k times those of φ, which are integrated with it."""
-        self.resolve_level(level)
-        rows = self.check_points(x).reshape(-1, 4)
-        value, gradient = rows.new_zeros(len(rows)), torch.zeros_like(rows)
-        for index in range(len(self.keys.times)):
-            weight, slope = self.keys.weight(index, rows[:, 3])
-            heard = ((weight != 0) | (slope != 0)).nonzero()[:, 0]
-            position, time = rows[heard, :3], rows[heard, 3]
-            span = _Span(self.velocity, time, self.keys.times[index])
-            still = torch.eye(3, 4, dtype=x.dtype, device=x.device).reshape(1, 12).expand(len(heard), -1)
-            begin = torch.cat((position, still), dim=1)
+
+        def carried(index: int, rows: Tensor) -> tuple[Tensor, Tensor]:
+            span = _Span(self.velocity, rows[:, 3], self.keys.times[index])
+            still = torch.eye(3, 4, dtype=x.dtype, device=x.device).reshape(1, 12).expand(len(rows), -1)
+            begin = torch.cat((rows[:, :3], still), dim=1)
             state = integrate_rows(span.with_derivatives, begin, x.new_zeros(()), x.new_ones(()), self._solver)
             jet = self.keys.key(index).jet(state[:, :3])
-            carried = (state[:, 3:].reshape(-1, 3, 4) * jet.gradient[:, :, None]).sum(dim=1)
-            blend = torch.nn.functional.pad((slope[heard] * jet.value)[:, None], (3, 0))
-            value = value.index_add(0, heard, weight[heard] * jet.value)
-            gradient = gradient.index_add(0, heard, weight[heard, None] * carried + blend)
-        return Jet(value.reshape(x.shape[:-1]), gradient.reshape(x.shape), x.new_empty((*x.shape[:-1], 0)))
+            return jet.value, (state[:, 3:].reshape(-1, 3, 4) * jet.gradient[:, :, None]).sum(dim=1)
+
+        self.resolve_level(level)
+        return self.keys.blended_jet(x, carried)
 
     @property
     def _solver(self) -> Solver:

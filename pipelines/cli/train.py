@@ -267,6 +267,8 @@ def _evolve_settings(arguments: argparse.Namespace) -> EvolveConfig:
 
 def _tell_evolution(record: dict[str, Any]) -> None:
     """A few lines on what came out."""
+    from ..evolve.topology import Topology
+
     checks = record["checks"]
     steps = sum(stage["steps"] for stage in record["stages"])
     print(f"{record['kind']} of {', '.join(record['shapes'])}: {steps:,} steps in {record['training_seconds']:.0f} s")
@@ -279,20 +281,13 @@ def _tell_evolution(record: dict[str, Any]) -> None:
     counts, volumes = ([frame[name] for frame in frames] for name in ("components", "volume"))
     print(f"  {len(frames)} frames: volume {min(volumes):.3g} to {max(volumes):.3g}, components {_runs(counts)}")
     for change in checks["changes"]:
-        before, after = (_topology(change[side]) for side in ("before", "after"))
+        before, after = (Topology(**change[side]) for side in ("before", "after"))
         near = f", at {' '.join(f'{number:.3g}' for number in change['place'])}" if change["place"] else ""
         print(f"  t = {change['time']:.3f}: {before} → {after}{near}")
     if slopes["mean"] is not None:
         print(f"  |∇f| {slopes['mean']:.3f}, from {slopes['low']:.3f} to {slopes['high']:.3f} at nine of ten points")
     for line in checks["warnings"]:
         print(f"warning: {line}")
-
-
-def _topology(found: dict[str, int]) -> str:
-    """``1 piece with 0 holes``."""
-    return " with ".join(
-        f"{found[name]} {word}{'s' * (found[name] != 1)}" for name, word in (("components", "piece"), ("holes", "hole"))
-    )
 
 
 def _runs(counts: list[int]) -> str:

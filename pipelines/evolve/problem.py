@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import Field, InputError, RigidMotion, Similarity, at_time, flow
-from ...neural_fields.spacetime.evolution import Law, VectorField, mean_curvature, normal_speed, transport
+from ...neural_fields import InputError, RigidMotion, Similarity, at_time, flow
+from ...neural_fields.spacetime.evolution import Law, VectorField, mean_curvature, morph, transport
 from ...neural_fields.spacetime.flow import IntegrationError, trajectories
 from ...neural_fields.spacetime.moving import Keyframes
 from ...neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
@@ -160,18 +160,8 @@ def _morph(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | Non
     guide = Keyframes(keys, [shape.field for shape in placed]).requires_grad_(False)
     ends = tuple(_end(shape, time, config.seed) for shape, time in pairs)
     similarity = _composed(shapes[0].similarity, region)
-    law, places = morph_law(guide), _placements(placed)
+    law, places = morph(guide, extend=True), _placements(placed)
     return Problem(similarity, known, bounds, law, ends, places, keys=keys, samples=number)
-
-
-def morph_law(guide: Field) -> Law:
-    """Level-set morphing that keeps distances: normal speed −∂g/∂t of the ``guide`` g, at the surface point below."""
-
-    @torch.no_grad()
-    def speed(x: Tensor, t: Tensor) -> Tensor:
-        return -guide.to(x.device).jet(at_time(x, t)).gradient[..., 3]
-
-    return normal_speed(speed, extend=True)
 
 
 def _smooth(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | None) -> Problem:

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ...datasets.landmarks import write_landmarks
 from ...neural_fields import Mesh, load_field
-from ...neural_fields.backend.files import write_whole
 from ..fit.train import fit
 from ..surface.surface import read_surface
 from ..training.folder import FIELD_FILE, STATE_FILE, find_field, is_fitted, read_record
@@ -81,11 +81,8 @@ def _pairs(config: EvolveConfig, scans: Mapping[str, Mesh], runs: Mapping[str, P
         return ()
     files = []
     for index, (before, after) in enumerate(itertools.pairwise(pose for pose in poses if pose is not None)):
-        rows = np.hstack((before.vertices[chosen[near]], after.vertices[chosen[near]]))
-        lines = [f"# the same vertices of {config.shapes[index]} and {config.shapes[index + 1]}"]
-        lines += [" ".join(f"{number:.9g}" for number in row) for row in rows]
         files.append(folder / f"pairs-{index:02d}.txt")
-        write_whole(files[-1], "\n".join(lines) + "\n")
+        write_landmarks(files[-1], *(pose.vertices[chosen[near]] for pose in (before, after)))
     return tuple(map(str, files))
 
 
