@@ -24,7 +24,7 @@ from mplicits.datasets.views.writing import write_neus
 from mplicits.neural_fields.networks.colors import ColorNetwork
 from mplicits.neural_fields.networks.multiscale import fit_sphere
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
-from mplicits.neural_fields.tracing.cones import cone_ends, cone_starts
+from mplicits.neural_fields.tracing.cones import cone_starts
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit.unoriented import SIGNING, give_signs
@@ -76,12 +76,11 @@ def tensors(module: nn.Module) -> list[Tensor]:
 def traced(device: torch.device) -> Result:
     field, (origin, directions) = small_multiscale(0.3).to(device), rays(device)
     near = cone_starts(field, origin, directions, tiles=(8, 4))
-    far = cone_ends(field, origin, directions, near.isfinite(), tiles=(8, 4))
-    hits = nf.sphere_trace(field, origin, directions, near=near, far=far, max_steps=64)
+    hits = nf.sphere_trace(field, origin, directions, near=near, max_steps=64)
     fixed = nf.sphere_trace(field, origin, directions, budget=(20, 5, 5))
     graph = nf.sphere_trace(field, origin, directions, max_steps=64, differentiable=True)
     graph.depth[graph.mask].sum().backward()
-    return near, far, *hits, *fixed, *(parameter.grad for parameter in field.base.parameters())
+    return near, *hits, *fixed, *(parameter.grad for parameter in field.base.parameters())
 
 
 def traced_in_time(device: torch.device) -> Result:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ..fields.field import Field
-from ..tracing.cones import CONE_LIPSCHITZ, cone_ends, cone_starts
+from ..tracing.cones import CONE_LIPSCHITZ, cone_starts
 from ..tracing.sphere import BOUNDING_RADIUS, Expected, Hits, Near, ball_points, trace_expected
 from .field import SpaceTimeSDF, TimeSlice, check_spacetime
 
@@ -110,9 +110,8 @@ class DynamicTracer:
 
     def _trace_key(self, field: Field, t: float) -> tuple[Hits, Tensor]:
         """Trace a key frame."""
-        start, end = self._tiles(field)
         unknown = torch.full_like(self.directions[..., 0], torch.inf)
-        hits, slope, near = self._trace(field, self._expected(t, unknown), start, end, self.reach)
+        hits, slope, near = self._trace(field, self._expected(t, unknown), self._tiles(field), torch.inf, self.reach)
         lasts = 0.0
         if self.reach:
             speed = self._measured_speed(t) if self.speed is None else self.speed
@@ -136,16 +135,12 @@ class DynamicTracer:
         close = before.abs() < max(near, 4 * self.reach)
         return margin * float((rate[close] if close.any() else rate).max())
 
-    def _tiles(self, field: Field) -> tuple[Tensor | float, Tensor | float]:
-        """Depths between which something may be near, as far as tiles show."""
+    def _tiles(self, field: Field) -> Tensor | float:
+        """Depths up to which tiles show that nothing is near."""
         if self.origins.shape != (3,) or self.directions.ndim != 3:
-            return 0.0, torch.inf
+            return 0.0
         cones = {"level": self.level, "lipschitz": CONE_LIPSCHITZ * self.lipschitz, "radius": self.radius}
-        near = cone_starts(field, self.origins, self.directions, clearance=self.reach, **cones)
-        if not self._frames:
-            return near, torch.inf
-        passing = near.isfinite() & self._frames[-1].depth.isinf()
-        return near, cone_ends(field, self.origins, self.directions, passing, clearance=self.reach, **cones)
+        return cone_starts(field, self.origins, self.directions, clearance=self.reach, **cones)
 
     def _expected(self, t: float, value: Tensor) -> Expected | None:
         """The last hits, extrapolated in time, with the known values where rays begin."""

@@ -48,7 +48,10 @@ def cone_starts(
     """
     field = as_field(field)
     level = field.resolve_level(level)
-    _check_image(field, origin, directions, lipschitz)
+    if origin.shape != (3,) or directions.ndim != 3:
+        shapes = f"origin {tuple(origin.shape)}, directions {tuple(directions.shape)}"
+        raise ValueError(f"{shapes}: expected (3,), (H, W, 3)")
+    check_rays(field, origin, directions, lipschitz=lipschitz)
     directions, length = unit_directions(directions)
     depth = torch.zeros_like(length)
     for tile in tiles:
@@ -56,52 +59,6 @@ def cone_starts(
         starts = depth[::tile, ::tile].reshape(-1)
         free = _march_cones(field, origin, cones, starts, level, lipschitz, radius, max_steps, clearance)
         depth = free[cones.of_pixel]
-    return depth / length
-
-
-@torch.no_grad()
-def cone_ends(
-    field: FieldLike,
-    origin: Tensor,
-    directions: Tensor,
-    mask: Tensor,
-    *,
-    level: int = -1,
-    tiles: Sequence[int] = (32, 8),
-    lipschitz: float = 1.0,
-    radius: float = BOUNDING_RADIUS,
-    max_steps: int = CONE_STEPS,
-    clearance: float = 0.0,
-) -> Tensor:
-    """Depths ``(H, W)`` from which on whole tiles of an image are empty, for ``far`` of `sphere_trace`.
-
-    As `cone_starts`, from behind: with v = |f_0| at depth t on the axis, the tile is empty from (t − (v − δ_0)/L) / (1
-    − σ) on. Tiles without a pixel of the ``mask`` ``(H, W)`` are left out, with infinite depths.
-    """
-    field = as_field(field)
-    level = field.resolve_level(level)
-    _check_image(field, origin, directions, lipschitz)
-    directions, length = unit_directions(directions)
-    reach = origin.norm() + radius
-    depth = torch.full_like(length, torch.inf)
-    delta = _margin(field, level, directions, clearance)
-
-    def advance(fixed: Columns, moving: Columns, on: Tensor) -> tuple[Columns, Tensor]:
-        (axis, sigma, entry), (end,) = fixed, moving
-        t = torch.where(on, end, 0)  # those that are left out may be infinite
-        value = field.value(origin + t[:, None] * axis, level=0)
-        closer = (t - ((value.abs() - delta) / lipschitz).clamp(min=0)) / (1 - sigma)
-        return (torch.minimum(t, closer),), (t - closer > t * sigma) & (closer > entry)
-
-    for tile in tiles:
-        cones = _Cones.of(directions, tile)
-        marched = mask.new_zeros(len(cones.axis), dtype=torch.uint8)
-        marched = marched.scatter_reduce(0, cones.of_pixel.flatten(), mask.flatten().to(torch.uint8), "amax").bool()
-        entry, leave = ball_crossing(origin.expand_as(cones.axis), cones.axis, radius + cones.spread * reach)
-        ends = torch.minimum(depth[::tile, ::tile].reshape(-1), leave / (1 - cones.spread))
-        fixed = (cones.axis, cones.spread, entry)
-        (ends,) = _until_all_stop(fixed, (ends,), marched & (ends > entry), advance, max_steps)
-        depth = torch.where(marched, ends, torch.inf)[cones.of_pixel]
     return depth / length
 
 
@@ -118,7 +75,8 @@ def _march_cones(
 ) -> Tensor:
     """How far each cone is empty; infinite where it leaves the ball of ``radius`` untouched."""
     axis, spread = cones.axis, cones.spread
-    delta = _margin(field, level, axis, clearance)
+    # Kept from the surface of level 0; a number on the device of the cones.
+    delta = clearance + (field.deltas[0].to(axis) if level else axis.new_zeros(()))
     # A ray of the cone may be in the ball where its axis is not; spread · reach is the most that they are apart.
     reach = origin.norm() + radius
     entry, leave = ball_crossing(origin.expand_as(axis), axis, radius + spread * reach)
@@ -145,11 +103,6 @@ def _march_cones(
 
     moving = (depth, depth, torch.full_like(depth, torch.nan))
     return _until_all_stop((axis, spread, leave), moving, depth.isfinite(), advance, max_steps)[0]
-
-
-def _margin(field: Field, level: int, like: Tensor, clearance: float) -> Tensor:
-    """Distance that cones keep from the surface of level 0, a number on the device of ``like``."""
-    return clearance + (field.deltas[0].to(like) if level else like.new_zeros(()))
 
 
 def _until_all_stop(
@@ -202,11 +155,3 @@ class _Cones(NamedTuple):
         away = (directions - directions[middle_row][:, middle_column]).norm(dim=-1)
         spread = away.new_zeros(len(axis)).scatter_reduce(0, of_pixel.flatten(), away.flatten(), "amax")
         return cls(axis, spread, of_pixel)
-
-
-def _check_image(field: Field, origin: Tensor, directions: Tensor, lipschitz: float) -> None:
-    if origin.shape != (3,) or directions.ndim != 3:
-        raise ValueError(
-            f"origin {tuple(origin.shape)}, directions {tuple(directions.shape)}: expected (3,), (H, W, 3)"
-        )
-    check_rays(field, origin, directions, lipschitz=lipschitz)
