@@ -1,14 +1,10 @@
 """The fake accelerator raises a GPU's errors, counts exactly, and changes no bit."""
 
-import copy
-import io
-
 import fake_accelerator
 import numpy as np
 import pytest
 import torch
 from fields import small_multiscale
-from mplicits.neural_fields import Sphere
 from torch import Tensor
 
 DEVICE = torch.device(fake_accelerator.NAME)
@@ -159,42 +155,3 @@ def test_waits_name_the_line_that_asked() -> None:
     (wait,) = [(why, where.split(":")[0]) for why, where in book.waits]
     assert wait == ("size", "neural_fields/networks/multiscale.py")
     assert book.synchronisations == field.num_levels - 1
-
-
-def test_modules_and_their_gradients() -> None:
-    here = torch.nn.Sequential(torch.nn.Linear(3, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1))
-    there = copy.deepcopy(here).to(DEVICE)
-    assert all(isinstance(p, torch.nn.Parameter) and p.device.type == fake_accelerator.NAME for p in there.parameters())
-    x = torch.rand(10, 3)
-    for model, points in ((here, x), (there, x.to(DEVICE))):
-        optimiser = torch.optim.Adam(model.parameters())
-        for _ in range(3):
-            optimiser.zero_grad()
-            model(points).square().mean().backward()
-            optimiser.step()
-    again = copy.deepcopy(there)
-    for a, b, c in zip(here.parameters(), there.parameters(), again.parameters(), strict=True):
-        assert a.equal(b.detach().cpu())
-        assert b.detach().equal(c.detach())
-        assert b.data_ptr() != c.data_ptr()
-    assert {dtype for p in there.double().parameters() for dtype in (p.dtype, p.inner.dtype)} == {torch.float64}
-
-
-def test_states_are_saved_and_loaded() -> None:
-    there = torch.nn.Linear(3, 2).to(DEVICE)
-    file = io.BytesIO()
-    torch.save(there.state_dict(), file)
-    file.seek(0)
-    back = torch.load(file, weights_only=True, map_location="cpu")
-    other = torch.nn.Linear(3, 2).to(DEVICE)
-    other.load_state_dict(back)
-    assert other.weight.equal(there.weight)
-
-
-def test_a_field_that_forgets_its_device_is_caught() -> None:
-    class Forgetful(Sphere):
-        def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-            return super().value(x + torch.zeros(3), level=level)
-
-    with pytest.raises(RuntimeError, match="same device"):
-        Forgetful().to(DEVICE).value(on_device(5, 3))

@@ -25,7 +25,7 @@ from benchmarks.paper.isolation import ISOLATION, IndependentLevels, isolation_t
 from benchmarks.paper.judge import fit_config
 from benchmarks.paper.methods import REGISTRY
 from benchmarks.paper.sheets import write_sheets
-from benchmarks.paper.speed import MARCHING_CUBES, NORMALS, grid_seconds
+from benchmarks.paper.speed import MARCHING_CUBES, NORMALS
 from benchmarks.shapes.sampled_error import approximation_error, near_surface
 
 HALF = np.array([0.5, 0.3, 0.4])
@@ -58,13 +58,6 @@ def test_without_bands_is_the_sum_of_all_levels_everywhere() -> None:
     torch.testing.assert_close(everywhere.jet(x).gradient, gradients)
     assert not torch.allclose(everywhere.value(x), field.value(x))
     assert everywhere.in_band(x, level=2).all()
-
-
-def test_up_to_a_level() -> None:
-    field, x = small(), 2 * torch.rand(200, 3) - 1
-    assert [training.up_to(field, level).num_levels for level in range(3)] == [1, 2, 3]
-    for level in range(3):
-        torch.testing.assert_close(training.up_to(field, level).value(x), field.value(x, level=level))
 
 
 def test_independent_levels_hand_over_inside_their_bands() -> None:
@@ -153,22 +146,6 @@ def test_a_residual_without_bands_learns_the_whole_domain(base: training.Base) -
     x = 1.6 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(5)) - 0.8
     exact = index.signed(x)
     assert float((field.value(x) - exact).abs().mean()) < float((base.field.base.value(x) - exact).abs().mean())
-
-
-def test_grid_seconds_count_what_was_left_out() -> None:
-    rows = []
-
-    class Slow(Sphere):
-        def value(self, x: torch.Tensor, *, level: int = -1) -> torch.Tensor:
-            rows.append(x.clone())
-            return super().value(x, level=level)
-
-    assert grid_seconds(Slow(radius=0.5), 8) > 0
-    whole = torch.cat(rows[1:])  # the first call warms up
-    assert len(whole) == len(torch.unique(whole, dim=0)) == 9**3
-    rows.clear()
-    grid_seconds(Slow(radius=0.5), 8, every=4)
-    assert sorted({round(float(part[0, 0]), 3) for part in rows[1:]}) == [-0.51, 0.51]
 
 
 def record(method: str, outputs: list[dict[str, Any]], *, shape: str = "ball", **more: Any) -> dict[str, Any]:

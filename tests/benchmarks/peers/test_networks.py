@@ -1,6 +1,5 @@
 """BACON, IDF, BANF and the single SIREN: what their papers say of the fields, and what their recipes reach."""
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,9 +21,9 @@ from test_field_contract import (  # noqa: F401
 )
 
 from benchmarks.paper import networks
+from benchmarks.paper.grids import BanfRecipe, InstantNgpRecipe
 from benchmarks.paper.recipe import Recipe, descend
 from benchmarks.peers import BaconSDF, BanfSDF, HashGridSDF, IdfSDF
-from benchmarks.peers.idf import attenuation
 
 
 def small_bacon() -> BaconSDF:
@@ -115,14 +114,6 @@ def test_idf_moves_the_surface_by_no_more_than_its_limit() -> None:
         torch.testing.assert_close(field.value(x), expected, atol=1e-5, rtol=0)
 
 
-def test_attenuation_is_a_half_at_its_reach_and_has_its_derivative() -> None:
-    value = torch.linspace(-0.5, 0.5, 101, dtype=torch.float64, requires_grad=True)
-    chi, slope = attenuation(value, 0.05)
-    torch.testing.assert_close(torch.autograd.grad(chi.sum(), value)[0], slope)
-    assert float(attenuation(torch.tensor(0.05), 0.05)[0]) == pytest.approx(0.5)
-    assert all(a > b for a, b in itertools.pairwise(chi[50:].detach().tolist()))
-
-
 def test_they_train_through_their_gradients(make: Callable[[], Field]) -> None:
     field = make()
     jet = field.jet(2 * torch.rand(50, 3) - 1)
@@ -154,6 +145,13 @@ def error_near_the_sphere(recipe: Recipe, cloud: OrientedCloud) -> float:
 def test_recipe_finds_a_sphere(recipe: type[Recipe], untrained: Recipe, sphere: OrientedCloud) -> None:
     after, before = error_near_the_sphere(recipe(), sphere), error_near_the_sphere(untrained, sphere)
     assert after < min(0.02, before / 5)
+
+
+@pytest.mark.parametrize(
+    "recipe", [InstantNgpRecipe("coarse"), InstantNgpRecipe("fine"), BanfRecipe()], ids=lambda recipe: recipe.name
+)
+def test_recipe_of_a_grid_finds_a_sphere(recipe: Recipe, sphere: OrientedCloud) -> None:
+    assert error_near_the_sphere(recipe, sphere) < 0.015
 
 
 @pytest.mark.parametrize("recipe", with_steps(4), ids=NAMES)
