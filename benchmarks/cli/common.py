@@ -78,7 +78,7 @@ def number(
     parser: argparse._ArgumentGroup | argparse.ArgumentParser,
     flag: str,
     kind: Callable[[str], float],
-    default: float | Sequence[int] | None,
+    default: float | Sequence[float] | None,
     about: str,
     **more: Any,
 ) -> None:

@@ -8,7 +8,16 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
-from mplicits.pipelines.cli.common import Command, add_flags, add_settings, positive, read_settings, whole
+from mplicits.pipelines.cli.common import (
+    Command,
+    add_flags,
+    add_settings,
+    picture_size,
+    positive,
+    read_settings,
+    whole,
+)
+from mplicits.pipelines.cli.views import SCENE_NAMES
 from mplicits.pipelines.training.settings import EvolveConfig, ReconstructConfig, given_flags, input_error, load_config
 
 from .common import folder_flag, measured_flags, number, run_benches
@@ -20,7 +29,7 @@ GEOMETRIES = ("multiscale", "neus", "single")  # those of `bench.geometries`
 
 
 def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
-    what = "an exact scene (painted-sphere, striped-torus, figure, statue), or the path of posed photographs"
+    what = "an exact scene (painted-sphere, striped-torus, figure, statue, corner), or the path of posed photographs"
     parser.add_argument("scenes", nargs="+", metavar="SCENE", help=what)
     folder_flag(parser)
     number(parser, "--views", whole(2, 10_000), 24, "of an exact scene")
@@ -91,6 +100,35 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     if arguments.neus_learning_rate is not None:
         options["neus_learning_rate"] = arguments.neus_learning_rate
     return run_benches(arguments, [ReconstructBench(scenes=scenes, config=config, **options)], out=arguments.out)
+
+
+def _consistency_arguments(parser: argparse.ArgumentParser) -> None:
+    folder_flag(parser)
+    parser.add_argument(
+        "--scene", choices=SCENE_NAMES, default="corner", metavar="NAME", help="an exact scene (corner)"
+    )
+    number(parser, "--views", whole(2, 10_000), 49, "of the scene")
+    what = "images of N × N pixels, or of W × H (200x150)"
+    parser.add_argument("--size", type=picture_size, default=(200, 150), metavar="N|WxH", help=what)
+    number(parser, "--samples", whole(1, 16), 2, "rays per pixel and direction of the images")
+    number(parser, "--weights", float, (0.0, 0.5), "of the term, a training for each", nargs="+")
+    number(parser, "--train-steps", whole(1), (5000, 4000), "of each training: so many that times are alike", nargs="+")
+    measured_flags(parser, 256, 300_000)
+    add_flags(parser, "--json")
+    add_settings(parser, ReconstructConfig, about="of all trainings")
+
+
+def _consistency(arguments: argparse.Namespace) -> int:
+    for name in ("consistency", "steps"):
+        if name in given_flags(arguments, ReconstructConfig):
+            raise input_error(f"--{name}: differs between the trainings; give --weights and --train-steps")
+    config = read_settings(arguments, ReconstructConfig)
+    from ..scenes.consistency import ConsistencyBench
+
+    options = {name: getattr(arguments, name) for name in ("scene", "views", "size", "resolution", "eval_samples")}
+    options |= {"weights": tuple(arguments.weights), "steps": tuple(arguments.train_steps)}
+    bench = ConsistencyBench(rays=arguments.samples, config=config, device=config.device, **options)
+    return run_benches(arguments, [bench], out=arguments.out)
 
 
 FROM_CASES = ("kind", "shapes", "times", "velocity", "axis", "center", "angle", "twist", "alpha")
@@ -220,6 +258,15 @@ SCENES: Mapping[str, Command] = MappingProxyType(
             _reconstruct,
             "Train the network of NeuS and the multiscale geometry on the same rays of posed photographs: PSNR of "
             "held-out views, Chamfer distance where the surface is known, parameters, time and FLOPs.",
+        ),
+        "consistency": Command(
+            "photographs compared with each other, on an exact scene",
+            """  python -m benchmarks consistency -o bench
+  python -m benchmarks consistency --size 400x300 --weights 0 0.5 --train-steps 4000 3200 -o bench""",
+            _consistency_arguments,
+            _consistency,
+            "Train on photographs of an exact scene without and with the comparison of neighbouring photographs: "
+            "accuracy, completeness, flat walls, edges, held-out views, seconds and memory.",
         ),
         "evolve": Command(
             "surfaces that move: exact cases, and morphs of meshes",

@@ -26,6 +26,7 @@ import torch
 from mplicits.neural_fields import Field, Jet
 from mplicits.neural_fields.networks.colors import BackgroundField, ColorNetwork
 from mplicits.neural_fields.networks.multiscale import levels_of
+from mplicits.pipelines.reconstruct.consistency import GreyPictures
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
 from mplicits.pipelines.reconstruct.objective import GraphTrainer, SceneObjective, scene_trainer
 from mplicits.pipelines.training.cuda_graphs import Recorder, Results, Work
@@ -97,6 +98,7 @@ def train_watched(
     config: ReconstructConfig,
     flag: StopFlag,
     *,
+    pictures: GreyPictures | None = None,
     seconds: float | None = None,
     report: Callable[[Progress], None] | None = None,
 ) -> Watched:
@@ -109,6 +111,7 @@ def train_watched(
         pool: the pixels.
         config: settings.
         flag: see `stop_on_signals`.
+        pictures: for the term of consistency.
         seconds: end the schedule after so long, and not after ``config.steps``.
         report: called now and then.
     """
@@ -118,7 +121,7 @@ def train_watched(
     model.geometry, levels = counted(plain)
     colors, outsides = _RowCounter(model.color), _RowCounter(model.outside)
     config = replace(config, steps=config.steps if seconds is None else ENDLESS)
-    trainer = scene_trainer(model, pool, config, seconds=seconds)
+    trainer = scene_trainer(model, pool, config, pictures=pictures, seconds=seconds)
     if isinstance(trainer, GraphTrainer):
         trainer.graphs.recorder = Tallied(trainer.graphs.recorder, [*levels, colors, outsides])
     clocks, every = None, REPORT_EVERY

@@ -19,6 +19,7 @@ from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.neural_fields.meshing.extract import extract_mesh
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.pipelines.mesh.files import write_mesh
+from mplicits.pipelines.reconstruct.consistency import GreyPictures
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.views import ViewImage, comparison_sheet, held_out, measure, render_image
 from mplicits.pipelines.render.picture import Image, contact_sheet, write_picture
@@ -192,7 +193,8 @@ class ReconstructBench(Benchmark[ReconstructRow]):
             report(dataclasses.replace(progress, stage=stage, steps=config.steps))
 
         with stop_on_signals() as flag:
-            watched = train_watched(model, pool, config, flag, seconds=seconds, report=told)
+            pictures = GreyPictures(train, device) if config.consistency else None
+            watched = train_watched(model, pool, config, flag, pictures=pictures, seconds=seconds, report=told)
         if not watched.finished:
             raise Interrupted(context.out)
         objective, level = watched.trainer.objective, watched.trainer.objective.level_at(watched.trainer.fraction)

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...neural_fields import Box, Capsule, Field, Similarity, Sphere, Torus, Union, sphere_trace
+from ...neural_fields import Box, Capsule, Field, FunctionField, Similarity, Sphere, Torus, Union, sphere_trace
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ...neural_fields.meshing.extract import Mesh, extract_mesh
 from ..cameras import UP_AXES, Camera, look_at
@@ -21,12 +21,15 @@ from ..clouds.cleaning.orientation import fibonacci_directions
 from ..clouds.point_cloud import PointCloud
 from ..views.formats.shots import DepthMap
 from ..views.images import PosedImage, PosedImages
+from .corner import corner, corner_colors
 from .samples import sample_surface
 from .statue import Statue
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Rgb = tuple[float, float, float]
+Size = int | tuple[int, int]
+"""Width and height of images in pixels; one number for both."""
 
 RAYS_AT_ONCE = 1 << 17
 LAMP = (0.4, 0.7, 0.6)  # towards the lamp, for shaded scenes
@@ -45,6 +48,7 @@ class Scene:
         radius: of a ball around the origin that holds the surface.
         up: "y" or "z", the axis that points up.
         lipschitz: bound on the slope of the field.
+        frontal: whether it is photographed from the front alone, as in DTU, and not from all sides.
     """
 
     name: str
@@ -53,17 +57,18 @@ class Scene:
     radius: float
     up: str = "y"
     lipschitz: float = 1.0
+    frontal: bool = False
 
 
-def scene_cameras(scene: Scene, *, views: int = 24, size: int = 64, seed: int = 0) -> list[Camera]:
+def scene_cameras(scene: Scene, *, views: int = 24, size: Size = 64, seed: int = 0) -> list[Camera]:
     """`cameras_around` a scene."""
-    return cameras_around(scene.radius, up=scene.up, views=views, size=size, seed=seed)
+    return cameras_around(scene.radius, up=scene.up, views=views, size=size, seed=seed, frontal=scene.frontal)
 
 
 def render_scene(
     scene: Scene,
     views: int = 24,
-    size: int = 64,
+    size: Size = 64,
     *,
     seed: int = 0,
     samples: int = 3,
@@ -77,7 +82,7 @@ def render_scene(
     Args:
         scene: from `SCENES`, or another.
         views: number of images.
-        size: width and height of the images, in pixels.
+        size: width and height of the images in pixels, or one number for both.
         seed: of the cameras and the points.
         samples: rays per pixel and direction.
         shaded: whether a fixed lamp lights the shape; without it, the images show the paint itself.
@@ -89,7 +94,8 @@ def render_scene(
         ValueError: ``views``, ``size`` or ``samples`` is not positive.
     """
     cameras = scene_cameras(scene, views=views, size=size, seed=seed)
-    together = max(1, RAYS_AT_ONCE // max(1, size * samples) ** 2)
+    pixels = cameras[0].width * cameras[0].height
+    together = max(1, RAYS_AT_ONCE // max(1, pixels * samples**2))
     images: list[PosedImage] = []
     for first in range(0, views, together):
         some = cameras[first : first + together]
@@ -253,22 +259,50 @@ def _checks(points: Float64) -> Float64:
 
 
 def cameras_around(
-    radius: float, *, up: str = "y", views: int = 24, size: int = 64, seed: int = 0, middle: Sequence[float] = (0, 0, 0)
+    radius: float,
+    *,
+    up: str = "y",
+    views: int = 24,
+    size: Size = 64,
+    seed: int = 0,
+    middle: Sequence[float] = (0, 0, 0),
+    frontal: bool = False,
 ) -> list[Camera]:
-    """Upright cameras on a sphere around a ball of ``radius``, with all of it in square images of ``size`` pixels.
+    """Upright cameras on a sphere around a ball of ``radius``, with all of it in their images.
 
-    They stand on a Fibonacci lattice that is turned at random: another seed gives other views.
+    They stand on a Fibonacci lattice that is turned at random, or moved where they are `frontal_directions`: another
+    seed gives other views.
     """
-    for name, number in (("views", views), ("size", size)):
+    width, height = (size, size) if isinstance(size, int) else size
+    for name, number in (("views", views), ("size", min(width, height))):
         if number < 1:
             raise ValueError(f"{name}={number}: expected at least one")
-    # The orthogonal factor of a Gaussian matrix is a uniform rotation or reflection.
-    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
-    distance = 4.0  # of the eyes from the middle, in radii
-    eyes = np.array(middle) + distance * radius * fibonacci_directions(views) @ turn.T
-    # A ball of radius r at distance d fills the angle 2 asin(r / d); one of 1.1 radii fills the images.
-    fov = 2 * float(np.degrees(np.arcsin(1.1 / distance)))
-    return [look_at(torch.from_numpy(eye), middle, up=UP_AXES[up], fov=fov, width=size, height=size) for eye in eyes]
+    random, distance = np.random.default_rng(seed), 4.0  # of the eyes from the middle, in radii
+    if frontal:
+        away = distance * radius * frontal_directions(views, float(random.uniform()), up=up)
+    else:
+        # The orthogonal factor of a Gaussian matrix is a uniform rotation or reflection.
+        away = distance * radius * fibonacci_directions(views) @ np.linalg.qr(random.normal(size=(3, 3)))[0].T
+    eyes = np.array(middle) + away
+    # A ball of radius r at distance d fills the angle 2 asin(r / d); one of 1.1 radii fills the shorter side.
+    half = np.arcsin(1.1 / distance)
+    half = half if height <= width else np.arctan(np.tan(half) * height / width)
+    fov = 2 * float(np.degrees(half))
+    return [look_at(torch.from_numpy(eye), middle, up=UP_AXES[up], fov=fov, width=width, height=height) for eye in eyes]
+
+
+def frontal_directions(count: int, shift: float = 0.0, *, up: str = "y") -> Float64:
+    """Unit vectors ``(count, 3)`` on the part of a sphere where DTU's cameras stand: 49 are about 9° apart.
+
+    A Fibonacci lattice from 45° left to 45° right of the front (+z for ``up="y"``, −y for ``up="z"``) and 5° to 50°
+    above the horizon. ``shift`` in [0, 1] moves it sideways.
+    """
+    place = np.arange(count)
+    azimuth = np.radians(45.0) * (2 * ((place * (5**0.5 - 1) / 2 + shift) % 1) - 1)
+    low, high = np.sin(np.radians((5.0, 50.0)))
+    rise = low + (high - low) * (place + 0.5) / count
+    side, front = np.sqrt(1 - rise**2) * np.sin(azimuth), np.sqrt(1 - rise**2) * np.cos(azimuth)
+    return np.stack((side, rise, front) if up == "y" else (side, -front, rise), axis=1)
 
 
 def developed(light: NDArray[np.floating], mask: NDArray[np.bool_], samples: int) -> tuple[Float32, Float32]:
@@ -308,6 +342,7 @@ SCENES: Mapping[str, Callable[[], Scene]] = MappingProxyType(
         "striped-torus": lambda: Scene("striped-torus", Torus(major=0.45, minor=0.2), _stripes, radius=0.65, up="z"),
         "figure": _figure,
         "statue": _statue,
+        "corner": lambda: Scene("corner", FunctionField(corner), corner_colors, radius=0.88, frontal=True),
     }
 )
 """Makers of scenes by name."""

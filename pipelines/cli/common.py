@@ -120,6 +120,12 @@ def between(low: float, high: float) -> Callable[[str], float]:
     return _converter(float, lambda number: low <= number <= high, f"a number from {low:g} to {high:g}")
 
 
+def picture_size(text: str) -> tuple[int, int]:
+    """A converter: width and height in pixels, ``64`` or ``200x150``."""
+    width, _, height = text.partition("x")
+    return whole(8, 4096)(width), whole(8, 4096)(height or width)
+
+
 positive = _converter(float, lambda number: 0 < number < math.inf, "a number > 0")
 finite = _converter(float, math.isfinite, "a number")
 

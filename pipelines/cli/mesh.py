@@ -83,7 +83,7 @@ MESH = Command(
 def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("mesh", metavar="MESH", help="the mesh to judge")
     parser.add_argument("reference", metavar="REFERENCE", help="the true mesh, or a point cloud")
-    about = "posed photographs: say, too, how near the mesh is where two of them see the reference"
+    about = "posed photographs: measure, too, where they see the reference (in their masks), as DTU does"
     parser.add_argument("--photos", metavar="DATA", help=about)
     add_flags(parser, "--samples", type=whole(1), default=500_000, help="on each surface (500000)")
     add_flags(parser, "--seed", help="of the samples (0)")
@@ -97,13 +97,13 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     if arguments.photos is None:
         metrics = evaluate_files(arguments.mesh, arguments.reference, **options)
     else:
-        from ...datasets.views.images import read_cameras
+        from ...datasets.views.images import read_posed_images
         from ..reconstruct.views import count_views
         from ..training.progress import counter_bar
 
-        cameras = [camera for _, camera in read_cameras(arguments.photos)]
+        views = [(view.camera, view.mask) for view in read_posed_images(arguments.photos).views]
         with counter_bar("photographs") as progress:
-            view_counts = functools.partial(count_views, cameras, progress=progress)
+            view_counts = functools.partial(count_views, views, progress=progress)
             metrics = evaluate_files(arguments.mesh, arguments.reference, view_counts=view_counts, **options)
     print(format_metrics(metrics))
     write_json(arguments.json, dataclasses.asdict(metrics))

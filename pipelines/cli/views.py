@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args, get_type_hints
 
 from ..training.settings import ReconstructConfig, command_line, input_error
-from .common import Command, add_flags, check_output, positive, refuse, training, whole, write_json
+from .common import Command, add_flags, check_output, picture_size, positive, refuse, training, whole, write_json
 
 if TYPE_CHECKING:
     from ...datasets.views.poses.find_cameras import FoundCameras
@@ -142,7 +142,7 @@ CHECK_CAMERAS = Command(
 )
 
 
-SCENE_NAMES = ("painted-sphere", "striped-torus", "figure", "statue")
+SCENE_NAMES = ("painted-sphere", "striped-torus", "figure", "statue", "corner")
 FAULTS = ("poses", "pose", "image", "mirrored", "masks", "holes", "exposure")
 FORMATS = ("neus", "transforms", "colmap", "colmap-text")
 
@@ -154,7 +154,8 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
     what = "neus (cameras_sphere.npz), transforms (.json of nerfstudio), colmap or colmap-text (neus)"
     parser.add_argument("--format", choices=FORMATS, default="neus", metavar="FORMAT", help=what)
     parser.add_argument("--views", type=whole(1, 10_000), default=24, metavar="N", help="how many images (24)")
-    parser.add_argument("--size", type=whole(8, 4096), default=64, metavar="N", help="images of N × N pixels (64)")
+    what = "images of N × N pixels, or of W × H (64)"
+    parser.add_argument("--size", type=picture_size, default=(64, 64), metavar="N|WxH", help=what)
     add_flags(parser, "--samples", type=whole(1, 16), default=3, help="rays per pixel and direction (3)")
     what = "light the shape by a fixed lamp, instead of the bare paint"
     parser.add_argument("--shaded", action="store_true", help=what)
@@ -198,7 +199,8 @@ def _scene(arguments: argparse.Namespace) -> int:
     writers = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap, "colmap-text": text}
     writers[arguments.format](folder, images)
     write_mesh(folder / "surface.ply", truth)
-    print(f"{folder}: {arguments.views} views of {arguments.size} × {arguments.size} pixels; the truth is surface.ply")
+    width, height = arguments.size
+    print(f"{folder}: {arguments.views} views of {width} × {height} pixels; the truth is surface.ply")
     print("next:", command_line("check-cameras", folder, "-o", "cameras.glb"))
     return 0
 
@@ -208,12 +210,13 @@ SCENE = Command(
     """  mplicits scene painted-sphere -o sphere
   mplicits scene figure -o figure --format transforms --views 40 --size 200
   mplicits scene statue -o statue --format colmap --shaded
+  mplicits scene corner -o corner --views 49 --size 400x300
   mplicits scene figure -o measured --format transforms --depths
   mplicits scene figure -o unsharp --fault poses
   mplicits scene spot.obj -o spot --format transforms --views 40 --shaded""",
     _scene_arguments,
     _scene,
     "Draw a shape whose surface and colours are known in closed form, or a mesh of your own, from cameras all around "
-    "it, and write images, masks and cameras as a data set, with the true surface beside them. A mesh without colours "
-    "is lit clay.",
+    "it (of corner, in front), and write images, masks and cameras as a data set, with the true surface beside them. A "
+    "mesh without colours is lit clay.",
 )

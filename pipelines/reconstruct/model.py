@@ -260,13 +260,18 @@ class RayPool:
             return sampler.rows(count, generator)
 
         rows = graph_input(draw, self.device)
-        view, pixel = self.owners[rows].long(), self.pixels[rows].long()
+        view = self.owners[rows].long()
         fx, fy, cx, cy = self.lens[view].unbind(dim=1)
-        x, y = pixel % self.widths[view], pixel // self.widths[view]
+        x, y = self.places(rows).unbind(dim=1)
         local = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
         directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], local), dim=1)
         mask = torch.ones(len(rows), device=self.device) if self.masks is None else self.masks[rows] / 255
         return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows)
+
+    def places(self, rows: Tensor) -> Tensor:
+        """Columns and rows ``(R, 2)`` int64 of the pixels with these numbers ``(R,)`` in their pictures."""
+        pixel, width = self.pixels[rows].long(), self.widths[self.owners[rows].long()]
+        return torch.stack((pixel % width, pixel // width), dim=1)
 
 
 def _bytes(numbers: np.ndarray) -> Tensor:

@@ -11,15 +11,16 @@ import torch
 from torch import Tensor
 
 from ...neural_fields.backend.devices import graph_input, has_graph_inputs
-from ...neural_fields.backend.fixed_shapes import FixedShapes, fixed_shapes
+from ...neural_fields.backend.fixed_shapes import FixedShapes, first_rows, fixed_shapes
 from ...neural_fields.fields.losses import eikonal_loss
 from ...neural_fields.networks.grids import ValueGrid, split_tables
-from ...neural_fields.volume.render import Sampling
+from ...neural_fields.volume.render import Rendered, Sampling
 from ..training.cuda_graphs import CudaGraphRecorder, GraphCache, Recorder
 from ..training.settings import ReconstructConfig
 from ..training.trainer import ErrorWeightedSampler, Group, Objective, Trainer, warm_cosine
+from .consistency import Cameras, ConsistencyOptions, GreyPictures, Pixels, consistency_loss, surface_near
 from .measured import MeasuredDepths, depth_loss
-from .model import RayPool, SceneModel
+from .model import RayPool, Rays, SceneModel
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class Kind(NamedTuple):
     level: int  # the finest that is switched on
     annealing: bool  # whether slopes are still annealed
     measured: bool  # whether measured depths count
+    consistent: bool  # whether photographs are compared with each other
 
 
 class Outcome(NamedTuple):
@@ -61,12 +63,17 @@ class Outcome(NamedTuple):
 
 
 class SceneObjective(Objective):
-    """Losses of a scene against the pixels of a pool, and against depths measured in the same pictures."""
+    """Losses of a scene against the pixels of a pool and against measured depths, and of ``pictures`` by each other."""
 
-    schedule = Schedule()
+    schedule, patches = Schedule(), ConsistencyOptions()
 
     def __init__(
-        self, model: SceneModel, pool: RayPool, config: ReconstructConfig, measured: MeasuredDepths | None = None
+        self,
+        model: SceneModel,
+        pool: RayPool,
+        config: ReconstructConfig,
+        measured: MeasuredDepths | None = None,
+        pictures: GreyPictures | None = None,
     ) -> None:
         rate = warm_cosine(config.learning_rate)
         parts = [part for part in (model.color, model.outside, model.exposures) if part is not None]
@@ -87,6 +94,7 @@ class SceneObjective(Objective):
             )
         super().__init__(model, groups, torch.Generator().manual_seed(config.seed))
         self.model, self.pool, self.config = model, pool, config
+        self.pictures = pictures if config.consistency else None
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
         # Recent values, on the CPU, which reads them: samples evaluated per ray, and the surface's uncertainty.
         self.kept["lately"] = torch.tensor([0.0, 1 / float(model.inv_std.detach())])
@@ -170,6 +178,7 @@ class SceneObjective(Objective):
             level=self.level_at(done),
             annealing=done < self.config.anneal,
             measured=measured is not None and (done < self.schedule.faded or measured.is_exact),
+            consistent=self.pictures is not None and done >= self.patches.start,
         )
 
     def after_step(self, step: int, samples: Tensor) -> None:
@@ -223,6 +232,10 @@ class SceneObjective(Objective):
             depth = self.depth_term(self.measured, kind.level)
             terms["depth"] = depth
             total = total + config.depth_weight * depth
+        if self.pictures is not None and kind.consistent:
+            consistency = self.consistency_term(self.pictures, rays, (origins, directions), rendered, kind.level)
+            terms["consistency"] = consistency
+            total = total + config.consistency * consistency
         terms["uncertainty"] = 1 / self.model.inv_std
         return Outcome(terms, total, samples)
 
@@ -235,6 +248,29 @@ class SceneObjective(Objective):
         missed = depth_loss(self.model.geometry, rays, level=level, generator=self.generator)
         left = self.by_time(lambda done: max(1 - done / self.schedule.faded, 0.0))
         return torch.where(rays.exact, missed, left * missed).mean()
+
+    def consistency_term(
+        self, pictures: GreyPictures, rays: Rays, lines: tuple[Tensor, Tensor], rendered: Rendered, level: int
+    ) -> Tensor:
+        """The mean of `consistency_loss` over the first rays that meet something, along ``lines``: eyes, directions."""
+        pool, poses, options = self.pool, self.model.poses, self.patches
+        opaque = rendered.opacity.detach() > 0.5
+        rows = first_rows(opaque, min(options.patches, len(opaque)))
+        used, rows = rows < len(opaque), rows.clamp(max=len(opaque) - 1)
+        origins, directions, view = lines[0][rows], lines[1][rows], rays.view[rows]
+        # Half of the light is stopped before the median depth.
+        middle = (rendered.weights.detach()[rows].cumsum(dim=1) >= 0.5).int().argmax(dim=1, keepdim=True)
+        depth = rendered.depths[rows].gather(1, middle)[:, 0]
+        surface = surface_near(self.model.geometry, origins, directions, depth, options, level=level)
+        surface = surface._replace(found=surface.found & used)
+        cameras = Cameras(pool.eyes, pool.axes, pool.lens)
+        if poses is not None:
+            views = torch.arange(len(pool.eyes), device=pool.device).repeat_interleave(3)
+            eyes, columns = poses.moved(pool.eyes[views], pool.axes.mT.reshape(-1, 3), views)
+            cameras = Cameras(eyes[::3], columns.reshape(-1, 3, 3).mT, pool.lens)
+        distance = self.grid or (lambda x: self.model.geometry.value(x, level=0))
+        pixels = Pixels(view, pool.places(rays.row[rows]))
+        return consistency_loss(surface, pixels, cameras, pictures, distance, options).mean()
 
 
 CHOICES = ("samples", "colors", "outside")
@@ -362,9 +398,10 @@ def scene_trainer(
     config: ReconstructConfig,
     *,
     measured: MeasuredDepths | None = None,
+    pictures: GreyPictures | None = None,
     seconds: float | None = None,
 ) -> Trainer[SceneObjective]:
     """The training of a scene; see `SceneObjective` and `Trainer`. On a GPU its steps are CUDA graphs."""
-    objective = SceneObjective(model, pool, config, measured)
+    objective = SceneObjective(model, pool, config, measured, pictures)
     kind = GraphTrainer if config.graphs and pool.device.type == "cuda" else Trainer
     return kind(objective, stage="reconstruct", steps=config.steps, seconds=seconds, network_name="model")

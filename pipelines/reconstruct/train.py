@@ -29,6 +29,7 @@ from ..training.result import Run
 from ..training.scaffold import BUDGET, Budget, Training
 from ..training.settings import ReconstructConfig, TextureConfig
 from ..training.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
+from .consistency import GreyPictures
 from .hull import Agreement, begin
 from .measured import MeasuredDepths
 from .model import RayPool, SceneModel, build_scene
@@ -174,7 +175,8 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
             self.start = (
                 "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured, agreement)
             )
-        self.trainer = scene_trainer(self.model, pool, config, measured=self.measured)
+        pictures = GreyPictures(self.train_views, device) if config.consistency else None
+        self.trainer = scene_trainer(self.model, pool, config, measured=self.measured, pictures=pictures)
         # Of the training pixels, their masks, the cameras and what was measured.
         inputs = [pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks])]
         if self.measured is not None:

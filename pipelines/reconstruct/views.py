@@ -222,22 +222,27 @@ def _scaled(camera: Camera, share: float) -> Camera:
 
 
 def count_views(
-    cameras: Sequence[Camera],
+    views: Sequence[MaskedCamera],
     surface: Mesh,
     points: NDArray[np.float64],
     *,
     finest: int = 1024,
     progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.int64]:
-    """How many cameras ``(N,)`` see points ``(N, 3)`` of a surface: in their picture, with nothing before them.
+    """How many ``views`` ``(N,)`` see points ``(N, 3)`` of a surface: in picture and mask, with nothing before them.
 
-    ``finest`` pixels of the longer side decide what hides what. Ten of them wide is the strip beyond a rim that may
-    count as seen. ``progress`` is called with ``(done, total)`` after every camera.
+    Cameras are in the surface's coordinates. ``finest`` pixels of the longer side decide what hides what. Ten of them
+    wide is the strip beyond a rim that may count as seen. ``progress`` is called with ``(done, total)`` after every
+    camera.
     """
     counts = np.zeros(len(points), dtype=np.int64)
-    for index, camera in enumerate(cameras):
+    for index, (camera, mask) in enumerate(views):
         large = _scaled(camera, finest / max(camera.width, camera.height))
-        counts += sees(large, mesh_view(surface, large), points)
+        seen = sees(large, mesh_view(surface, large), points)
+        if mask is not None:
+            column, row = np.rint(camera.in_view(points[seen])[0]).astype(np.int64).T
+            seen[seen] = mask[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)] > OBJECT
+        counts += seen
         if progress is not None:
-            progress(index + 1, len(cameras))
+            progress(index + 1, len(views))
     return counts

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...datasets.cameras import Camera
 from ...datasets.clouds.readers.meshes import vertex_normals
-from ...datasets.synthetic.scenes import cameras_around, developed, lit
+from ...datasets.synthetic.scenes import Size, cameras_around, developed, lit
 from ...datasets.textured.mesh import TexturedMesh
 from ...datasets.views.formats.shots import DepthMap
 from ...datasets.views.images import PosedImage, PosedImages
@@ -34,7 +34,7 @@ FLAT, NEAR = 1.0, 10.0
 def photograph_mesh(
     path: str | Path,
     views: int = 24,
-    size: int = 64,
+    size: Size = 64,
     *,
     seed: int = 0,
     samples: int = 3,
@@ -46,7 +46,7 @@ def photograph_mesh(
 ) -> PosedImages:
     """Posed images of a mesh in its file's coordinates, as `render_scene` makes them of exact scenes.
 
-    A mesh without colours is grey clay, and always lit. ``size`` is the side of the images in pixels, ``samples`` rays
+    A mesh without colours is grey clay, and always lit. ``size`` is that of the images in pixels, ``samples`` rays
     per pixel and direction, ``seed`` that of the cameras and the sparse points. A fixed lamp lights the mesh if
     ``shaded``, with a highlight if ``glossy``; ``depths`` are those of the pixels' centres. Raises an InputError if the
     mesh cannot be read or has no faces.

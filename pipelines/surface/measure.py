@@ -25,19 +25,39 @@ ViewCounts = Callable[[Mesh, Float64], Int64]
 """How many photographs see points ``(N, 3)`` of the reference, both in its own coordinates; ``(N,)``."""
 
 
-@dataclass(frozen=True)
-class Visible:
-    """Figures of the part of the reference that two photographs or more see.
+class Distances(NamedTuple):
+    """Mean unsquared distances in INPUT units, as in DTU's evaluation (Jensen et al. 2014); None if nothing is visible.
 
     Attributes:
-        share: of the reference's area.
-        chamfer: as in `Metrics`, of samples that are visible or whose nearest one is; None if nothing is.
+        accuracy: from the mesh to the reference.
+        completeness: from the reference to the mesh.
+        overall: the mean of both.
+    """
+
+    accuracy: float | None
+    completeness: float | None
+    overall: float | None
+
+
+@dataclass(frozen=True)
+class Visible:
+    """Figures of the part of the reference that photographs see: its samples, and those whose nearest one is visible.
+
+    Attributes:
+        share: of the reference's area that two photographs or more see.
+        chamfer: as in `Metrics`, where two or more see; None if nothing is visible.
         chamfer_floor: the same of another sampling of the reference.
+        share_once: of the reference's area that one photograph or more sees.
+        distances: where one or more sees.
+        distances_floor: the same of another sampling of the reference.
     """
 
     share: float
     chamfer: float | None
     chamfer_floor: float | None
+    share_once: float
+    distances: Distances
+    distances_floor: Distances
 
 
 @dataclass(frozen=True)
@@ -59,7 +79,7 @@ class Metrics:
         mean_distance: mean unsquared distance over both directions, in INPUT units; ``scale`` of them are one unit.
         samples: on each surface.
         notes: what the reader of the figures should know.
-        visible: the same where two photographs or more see the reference; None if that was not asked for.
+        visible: figures of what photographs see; None if that was not asked for.
     """
 
     chamfer: float
@@ -159,9 +179,16 @@ def evaluate_surfaces(
         again = _ways(sample_points(reference, samples, of_floor)[0], target)
         floor = float(again.there.mean() + again.back.mean())
         if view_counts is not None:
-            is_visible = view_counts(given, similarity.to_input(target)) >= 2
-            ways = (_Ways(forward**2, np.asarray(nearest), backward**2), again)
-            visible = Visible(float(is_visible.mean()), *(_chamfer_where(is_visible, way) for way in ways))
+            counts = view_counts(given, similarity.to_input(target))
+            ways = _Ways(forward**2, np.asarray(nearest), backward**2)
+            visible = Visible(
+                share=float((counts >= 2).mean()),
+                chamfer=_chamfer_where(counts >= 2, ways),
+                chamfer_floor=_chamfer_where(counts >= 2, again),
+                share_once=float((counts >= 1).mean()),
+                distances=_distances_where(counts >= 1, ways, similarity.scale),
+                distances_floor=_distances_where(counts >= 1, again, similarity.scale),
+            )
         iou, iou_notes = _iou(mesh, reference, columns, closed=closed)
         notes.extend(iou_notes)
     precision, recall = float((forward < threshold).mean()), float((backward < threshold).mean())
@@ -217,6 +244,14 @@ def _chamfer_where(visible: NDArray[np.bool_], ways: _Ways) -> float | None:
     return float(there.mean() + back.mean()) if len(there) and len(back) else None
 
 
+def _distances_where(visible: NDArray[np.bool_], ways: _Ways, scale: float) -> Distances:
+    there, back = ways.there[visible[ways.nearest]], ways.back[visible]
+    if not (len(there) and len(back)):
+        return Distances(None, None, None)
+    accuracy, completeness = (scale * float(np.sqrt(squared).mean()) for squared in (there, back))
+    return Distances(accuracy, completeness, (accuracy + completeness) / 2)
+
+
 def shell_iou(a: Float64, b: Float64, *, voxel: float = 0.01) -> float:
     """Overlap of the voxels that hold points of ``a`` ``(N, 3)`` and of ``b`` ``(M, 3)``, on ONE grid.
 
@@ -253,6 +288,10 @@ def format_metrics(metrics: Metrics) -> str:
     if m.visible is not None:
         about = f"floor {optional(m.visible.chamfer_floor, '.3e')}; {m.visible.share:.2%} of the area"
         visible = [("chamfer where 2 photographs see", optional(m.visible.chamfer, ".3e"), about)]
+        floors, names = m.visible.distances_floor, ("mesh → reference", "reference → mesh", "mean of both")
+        about = f"{m.visible.share_once:.2%} of the area; floors {', '.join(optional(f, '.4g') for f in floors)}"
+        visible.append(("distance where 1 sees, input units", "", about))
+        visible += [(f"  {name}", optional(d, ".4g"), "") for name, d in zip(names, m.visible.distances, strict=True)]
     lines = [
         ("chamfer (squared L2, both ways)", f"{m.chamfer:.3e}", f"sampling floor {optional(m.chamfer_floor, '.3e')}"),
         ("  mesh → reference", f"{m.accuracy:.3e}", ""),

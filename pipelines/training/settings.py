@@ -407,6 +407,9 @@ class ReconstructConfig(TrainingSettings):
     eikonal_weight: float = setting(0.05, "weight of (|grad f| - 1)^2", at_least=0)
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)
     depth_weight: float = setting(0.5, "weight of measured depths (depth maps, COLMAP's points); 0: unused", at_least=0)
+    consistency: float = setting(
+        0.0, "weight of how patches of neighbouring photographs differ on the surface (1 - NCC); 0: unused", at_least=0
+    )
     anneal: float = _share(0.2, "share of the training with annealed slopes")
     least_weight: float = setting(1e-4, "samples that contribute less to their pixel get no colour", at_least=0)
     skip: float = _share(1e-3, "samples of smaller estimated weight are not evaluated; 0: all are")

@@ -15,6 +15,7 @@ from mplicits.neural_fields import Jet, Sphere
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct import train as reconstruct_texture
+from mplicits.pipelines.reconstruct.consistency import ConsistencyOptions
 from mplicits.pipelines.reconstruct.objective import SceneObjective
 from mplicits.pipelines.training.settings import ReconstructConfig, TextureConfig
 from mplicits.pipelines.training.trainer import Trainer
@@ -38,6 +39,10 @@ TINY_SCENE = ReconstructConfig(
 )
 # What few steps need to get anywhere.
 QUICK = {"learning_rate": 2e-3, "color_rate": 12.0, "sharpening": 8.0}
+# Patches for small pictures by few cameras all around.
+SMALL_PATCHES = ConsistencyOptions(
+    patches=16, reach=1, usual_angle=60.0, most_angle=150.0, facing=0.05, floor=-1.0, residual=0.05
+)
 
 
 def small_reconstructions(patch: pytest.MonkeyPatch) -> None:

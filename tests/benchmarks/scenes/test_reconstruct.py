@@ -11,6 +11,7 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.neural_fields import Siren, Sphere, Union, extract_mesh
 from mplicits.neural_fields.networks.colors import BackgroundField, ColorNetwork
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
+from mplicits.pipelines.reconstruct.consistency import GreyPictures
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.objective import GraphTrainer, SceneObjective, scene_trainer
 from mplicits.pipelines.training.settings import ReconstructConfig
@@ -75,8 +76,10 @@ def test_counted_flops_are_those_of_a_training(scene: BenchScene, geometry: str)
     assert watched.geometry_flops + watched.color_flops == pytest.approx(counter.get_total_flops(), rel=0.02)
 
 
-def with_graphs(model: SceneModel, pool: RayPool, config: ReconstructConfig, *, seconds: float | None) -> GraphTrainer:
-    objective = SceneObjective(model, pool, config)
+def with_graphs(
+    model: SceneModel, pool: RayPool, config: ReconstructConfig, *, pictures: GreyPictures | None, seconds: float | None
+) -> GraphTrainer:
+    objective = SceneObjective(model, pool, config, pictures=pictures)
     return GraphTrainer(objective, recorder=EagerRecorder(), stage="reconstruct", steps=config.steps, seconds=seconds)
 
 

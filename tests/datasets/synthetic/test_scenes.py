@@ -8,7 +8,7 @@ import pytest
 import torch
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.clouds.point_cloud import unit_rows
-from mplicits.datasets.synthetic import scenes
+from mplicits.datasets.synthetic import corner, scenes
 from mplicits.datasets.synthetic.scenes import LAMP, SCENES, Scene, render_scene, render_view
 from mplicits.neural_fields import Box, Similarity
 from mplicits.neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
@@ -163,11 +163,55 @@ def test_cameras_are_even_upright_and_held_out_by_seed(sphere):
     assert float(torch.cdist(eyes, other).diagonal().min()) > 0.1
 
 
+def test_frontal_cameras_are_even_and_in_front():
+    scene = SCENES["corner"]()
+    cameras = scenes.scene_cameras(scene, views=49, size=(40, 30), seed=1)
+    assert {(camera.width, camera.height) for camera in cameras} == {(40, 30)}
+    towards = torch.nn.functional.normalize(torch.stack([camera.eye for camera in cameras]), dim=1)
+    azimuth, rise = torch.rad2deg(torch.atan2(towards[:, 0], towards[:, 2])), torch.rad2deg(towards[:, 1].asin())
+    assert float(azimuth.abs().max()) <= 45
+    assert 5 < float(rise.min()) < 7
+    assert 48 < float(rise.max()) < 50
+    near = torch.rad2deg((towards @ towards.T).fill_diagonal_(-1).amax(dim=1).acos())
+    assert 5 < float(near.min()) < float(near.max()) < 12
+    above = scenes.frontal_directions(5, 0.3, up="z")
+    np.testing.assert_allclose(above[:, [0, 2, 1]] * (1, 1, -1), scenes.frontal_directions(5, 0.3), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(40, 30), (20, 90)])
+def test_pictures_that_are_not_square_show_the_whole_corner(size):
+    images = render_scene(SCENES["corner"](), 6, size, seed=3, samples=1)
+    for view in images.views:
+        assert view.mask.shape == size[::-1]
+        assert not any(edge.any() for edge in (view.mask[0], view.mask[-1], view.mask[:, 0], view.mask[:, -1]))
+        assert view.mask.mean() > 0.05
+
+
+def test_the_corner_has_what_photographs_find_hard():
+    """Exact distances to a flat wall, a sharp edge, a thin rod, a crease and a bowl; and a wall without texture."""
+    scene = SCENES["corner"]()
+    turn = corner.solids.tilt(torch.eye(3, dtype=torch.float64), corner.CENTER, corner.TURN)  # rows: turned axes
+
+    def distance(*places):
+        return scene.field.value(torch.tensor(places, dtype=torch.float64) @ turn.T).tolist()
+
+    assert distance((0.1, 0.3, -0.2), (-0.5, 0.4, -0.25)) == pytest.approx([0.1, 0.05])  # before the wall
+    assert distance((0.6, 0.48, -0.3), (0.63, 0.52, -0.3)) == pytest.approx([0.0, 0.05], abs=1e-8)  # its corner
+    assert distance((0.55, -0.3, -0.2), (0.55, -0.34, -0.28)) == pytest.approx([0.06, 0.02])  # in the crease
+    assert distance((0.04, 0.3, 0.16), (0.04, 0.4, 0.16)) == pytest.approx([-0.012, 0.088])  # the rod
+    assert distance((-0.26, -0.2, 0.1), (-0.26, -0.17, 0.1)) == pytest.approx([0.06, 0.09])  # in the bowl
+    wall = np.random.default_rng(0).uniform((-0.55, -0.3, -0.3), (0.55, 0.4, -0.3), (500, 3))
+    colors = scene.color(wall @ turn.numpy().T)
+    assert colors[wall[:, 0] > corner.PLAIN].std(axis=0).max() < 1e-12
+    assert colors[wall[:, 0] < corner.PLAIN].std(axis=0).min() > 0.1
+
+
 @pytest.mark.parametrize("name", CHEAP)
 def test_the_mesh_is_the_surface(name):
     scene = SCENES[name]()
     mesh = scenes.scene_mesh(scene, resolution=64)
-    assert np.abs(scene.field.value(torch.from_numpy(mesh.vertices)).numpy()).max() < 0.01
+    cell = 2 * 1.02 * scene.radius / 64  # what is cut off a right-angled edge or corner is less than half of it
+    assert np.abs(scene.field.value(torch.from_numpy(mesh.vertices)).numpy()).max() < cell / 2
     assert np.array_equal(mesh.colors, scene.color(mesh.vertices).astype(np.float32))
     if name == "painted-sphere":
         corners = mesh.vertices[mesh.faces]

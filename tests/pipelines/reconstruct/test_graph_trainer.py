@@ -11,6 +11,7 @@ from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields.backend.devices import GraphInputs
 from mplicits.neural_fields.networks.multiscale import fit_sphere
 from mplicits.pipelines.reconstruct import model as scene_model
+from mplicits.pipelines.reconstruct.consistency import GreyPictures
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import GraphTrainer, SceneObjective
@@ -22,7 +23,7 @@ from mplicits.pipelines.training.cuda_graphs import (
     Work,
 )
 from mplicits.pipelines.training.trainer import Trainer
-from reconstructions import QUICK, TINY_SCENE, painted_sphere, weights, without
+from reconstructions import QUICK, SMALL_PATCHES, TINY_SCENE, painted_sphere, weights, without
 from recorders import EagerRecorder
 from torch import Tensor
 
@@ -33,6 +34,7 @@ KINDS = {
     "neus": replace(TINY, geometry="neus", steps=20, march_grid=0),
     "cameras": replace(TINY, exposure="affine", cameras="refined"),
     "depths": TINY,
+    "consistency": replace(TINY, consistency=0.5, cameras="refined"),
 }
 
 
@@ -40,6 +42,7 @@ KINDS = {
 def _short_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """Starts from a rough sphere."""
     monkeypatch.setattr(scene_model, "fit_sphere", partial(fit_sphere, steps=40, batch=256))
+    monkeypatch.setattr(SceneObjective, "patches", SMALL_PATCHES)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +57,8 @@ def scene(images: PosedImages, name: str, device: torch.device) -> SceneObjectiv
     model = build_scene(config, has_masks=pool.has_masks, views=len(views)).to(device)
     measured = MeasuredDepths(views, images, device) if name == "depths" else None
     assert measured is None or len(measured)
-    return SceneObjective(model, pool, config, measured)
+    pictures = GreyPictures(views, device) if config.consistency else None
+    return SceneObjective(model, pool, config, measured, pictures)
 
 
 def replaying(images: PosedImages, name: str, device: torch.device) -> GraphTrainer:
@@ -83,7 +87,7 @@ def test_replayed_steps_are_the_same(name: str, images: PosedImages, monkeypatch
 
 
 # Which have all terms between them.
-@pytest.mark.parametrize("name", ["outside", pytest.param("cameras", marks=pytest.mark.slow), "depths"])
+@pytest.mark.parametrize("name", ["outside", pytest.param("cameras", marks=pytest.mark.slow), "depths", "consistency"])
 def test_the_host_never_waits_for_a_replayed_step(name: str, images: PosedImages, accelerator: torch.device) -> None:
     here, there = (replaying(images, name, device) for device in (torch.device("cpu"), accelerator))
     assert here.run()

@@ -11,12 +11,13 @@ from mplicits.neural_fields import Similarity, fit_sphere
 from mplicits.neural_fields.fields.losses import eikonal_loss
 from mplicits.neural_fields.volume.weights import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
+from mplicits.pipelines.reconstruct.consistency import GreyPictures
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import SceneObjective, Schedule, scene_trainer
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import Progress, StopFlag, Trainer
-from reconstructions import QUICK, TINY_SCENE, painted_sphere, weights, with_views, without
+from reconstructions import QUICK, SMALL_PATCHES, TINY_SCENE, painted_sphere, weights, with_views, without
 from torch import Tensor
 
 TINY = replace(TINY_SCENE, steps=8, **QUICK)
@@ -34,10 +35,12 @@ def images() -> PosedImages:
 
 
 def make(images: PosedImages, config: ReconstructConfig, *, depths: bool = False) -> Trainer[SceneObjective]:
+    """A training, with the terms of measured depths and of consistency where they are asked for."""
     pool = RayPool(images.views, images.similarity, torch.device("cpu"))
     measured = MeasuredDepths(images.views, images, pool.device) if depths else None
     scene = build_scene(config, has_masks=pool.has_masks, views=len(images.views))
-    return scene_trainer(scene, pool, config, measured=measured)
+    pictures = GreyPictures(images.views, pool.device) if config.consistency else None
+    return scene_trainer(scene, pool, config, measured=measured, pictures=pictures)
 
 
 def level(trainer: Trainer[SceneObjective]) -> int:
@@ -165,6 +168,27 @@ def test_a_stopped_training_continues_to_the_same_bits(images: PosedImages, dept
     assert [step for step, _ in train(second)] == list(range(stop + 1, 9))
     torch.testing.assert_close(weights(second), weights(whole), rtol=0, atol=0)
     assert second.losses == whole.losses
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_photographs_are_compared_once_the_surface_exists(
+    masked: bool, images: PosedImages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SceneObjective, "patches", SMALL_PATCHES)
+    images = images if masked else without(images, "mask")
+    config = replace(TINY, consistency=0.5, background="auto" if masked else "black")
+    whole, first, second = (make(images, config) for _ in range(3))
+    train(first, until=1)
+    assert "consistency" not in first.losses
+    train(first, until=4)
+    assert 0 < first.losses["consistency"] < 2
+    state = {name: tensor.clone() for name, tensor in first.state().items()}
+    second.restore(state)
+    train(second)
+    train(whole)
+    torch.testing.assert_close(weights(second), weights(whole), rtol=0, atol=0)
+    assert second.losses == whole.losses
+    assert "consistency" not in make(images, replace(config, consistency=0.0)).objective.losses(0, 0.9)[0]
 
 
 def relative() -> PosedImages:

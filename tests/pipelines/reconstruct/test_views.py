@@ -279,7 +279,8 @@ def test_counts_are_those_of_the_closed_form(size: int) -> None:
     surface = Mesh(np.asarray(both.vertices), np.asarray(both.faces))
     middle = surface.vertices[surface.faces].mean(axis=1)
     told: list[tuple[int, int]] = []
-    counts = posed.count_views(cameras, surface, middle, finest=512, progress=lambda *done: told.append(done))
+    views = [(camera, None) for camera in cameras]
+    counts = posed.count_views(views, surface, middle, finest=512, progress=lambda *done: told.append(done))
     assert told == [(1, 3), (2, 3), (3, 3)]
     sure = np.ones(len(middle), dtype=bool)
     exact = np.zeros(len(middle), dtype=int)
@@ -292,13 +293,19 @@ def test_counts_are_those_of_the_closed_form(size: int) -> None:
     assert sure.mean() > 0.4
     assert np.array_equal(counts[sure], exact[sure])
     assert set(np.unique(exact)) >= {0, 1, 2}
+    # A mask of the left half: what falls on the other half is not seen.
+    mask = np.zeros((size, size), np.float32)
+    mask[:, : size // 2] = 1
+    masked = posed.count_views([(cameras[0], mask)], surface, middle, finest=512)
+    left = cameras[0].in_view(middle)[0][:, 0] < size // 2 - 0.5
+    assert np.array_equal(masked, posed.count_views(views[:1], surface, middle, finest=512) * left)
 
 
 @pytest.mark.slow
 def test_evaluate_tells_how_near_the_mesh_is_where_photographs_see(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    images = painted_sphere(4, 8)
+    images = painted_sphere(4, 64)
     write_transforms(tmp_path / "photos", images)
     truth, cloud, figures = (tmp_path / name for name in ("ball.ply", "cloud.xyz", "figures.json"))
     trimesh.creation.icosphere(2, radius=0.6).export(truth)
@@ -308,7 +315,12 @@ def test_evaluate_tells_how_near_the_mesh_is_where_photographs_see(
     # A camera at four radii sees where the cosine is above 1 / 4; some 40 samples of 2000 are beside a rim.
     eyes = torch.stack([torch.nn.functional.normalize(view.camera.eye, dim=0) for view in images.views])
     twice = ((fibonacci_directions(20_000) @ eyes.T.numpy() > 0.25).sum(axis=1) >= 2).mean()
-    assert json.loads(figures.read_text())["visible"]["share"] == pytest.approx(twice, abs=0.05)
+    visible = json.loads(figures.read_text())["visible"]
+    assert visible["share"] == pytest.approx(twice, abs=0.05)
+    # The mesh is the reference: its distances are those of a sampling.
+    assert visible["distances"] == pytest.approx(visible["distances_floor"], rel=0.1)
     np.savetxt(cloud, np.random.default_rng(0).normal(size=(50, 3)))
     assert main(["evaluate", str(truth), str(cloud), *some]) == 2
     assert f"{cloud}: holds points" in capsys.readouterr().err
+    assert main(["evaluate", str(truth), str(truth), "--photos", str(tmp_path / "none")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -255,6 +255,14 @@ def test_what_no_photograph_sees_does_not_count():
     assert metrics.completeness == pytest.approx(0.5 * 0.5**2 / 3 * 2, rel=0.1)
     # Samples of half a square are twice as dense as those of a whole one, so both are within two of its floors.
     assert metrics.visible.chamfer < 2 * metrics.chamfer_floor
+    # Two photographs see the half, and one sees the rest, whose mean distance is 1/4 in the square's own units.
+    accuracy, completeness, overall = metrics.visible.distances
+    assert metrics.visible.share_once == 1
+    assert completeness == pytest.approx(0.5 * 0.25, rel=0.1)
+    assert accuracy < 1.5 * metrics.visible.distances_floor.accuracy
+    assert overall == pytest.approx((accuracy + completeness) / 2)
+    unseen = evaluate_surfaces(half, truth, samples=100, view_counts=lambda _, points: np.zeros(len(points), int))
+    assert unseen.visible.distances == (None, None, None)
     assert "chamfer where 2 photographs see" in measure.format_metrics(metrics)
     with pytest.raises(ValueError, match="view_counts"):
         evaluate_surfaces(truth, Mesh(truth.vertices, truth.faces[:0]), samples=10, view_counts=view_counts)

@@ -1,0 +1,249 @@
+"""Multi-view consistency: patches of neighbouring photographs, warped by the surface's tangent planes, correlate.
+
+Two photographs that show the same texture place a surface to a fraction of a pixel. A pixel's surface point and normal
+give a tangent plane. If it is right, its homography maps the patch around the pixel onto the same patch of a neighbour
+(Goesele et al. 2007; for neural surfaces Fu et al., "Geo-Neus", 2022).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...datasets.views.images import PosedImage
+from ...neural_fields.fields.field import FieldLike, as_field
+
+
+@dataclass(frozen=True)
+class ConsistencyOptions:
+    """How patches are chosen and compared. The values are this project's own, by experiment."""
+
+    start: float = 0.25  # share of the training after which the term counts: the surface exists by then
+    patches: int = 96  # pixels per step whose patches are compared, at most
+    reach: int = 3  # pixels of a patch on each side of its middle: 7 × 7
+    neighbours: int = 6  # photographs that a patch is compared with
+    best: int = 3  # of them that count, at most: others may show something in between
+    least_angle: float = 5.0  # degrees between the lines of sight of two photographs
+    usual_angle: float = 12.0  # the nearest to this are taken
+    most_angle: float = 25.0
+    facing: float = 0.3  # cosine between the normal and a line of sight, at least
+    texture: float = 0.02  # standard deviation of a patch's grey values in [0, 1], at least
+    floor: float = 0.3  # correlation below which two patches show different things
+    newton: int = 2  # steps from the median depth of a rendered ray to the surface
+    residual: float = 0.002  # distance from the surface after them, at most, in radii of the region
+    clearance: float = 0.04  # from which on a ray to a neighbour is tested for occlusion, in radii of the region
+    marches: int = 10  # steps of that test
+    stride: float = 0.02  # least length of a step, in radii of the region
+
+
+class Surface(NamedTuple):
+    """Surface points on rays, differentiable in the parameters of the field and in the rays."""
+
+    position: Tensor  # (R, 3)
+    normal: Tensor  # (R, 3) unit vectors
+    found: Tensor  # (R,) bool
+
+
+class Cameras(NamedTuple):
+    """Pinholes in unit-sphere coordinates."""
+
+    eyes: Tensor  # (V, 3)
+    axes: Tensor  # (V, 3, 3) columns are right, down and forward
+    lens: Tensor  # (V, 4) fx, fy, cx, cy in pixels
+
+
+class Pixels(NamedTuple):
+    """Pixels of photographs: numbers of the pictures ``(R,)`` int64, and columns and rows ``(R, 2)`` int64."""
+
+    view: Tensor
+    place: Tensor
+
+
+class GreyPictures:
+    """Grey values ``(V, H, W)`` of photographs, padded to one size, and their ``masks`` as uint8, if all have one."""
+
+    def __init__(self, views: Sequence[PosedImage], device: torch.device) -> None:
+        self.sizes = torch.tensor([[view.camera.width, view.camera.height] for view in views], device=device)
+        grey, masks = (np.zeros((len(views), *self.sizes.amax(dim=0).tolist()[::-1]), kind) for kind in ("f4", "u1"))
+        self.masks = None
+        for index, view in enumerate(views):
+            part = (index, slice(view.camera.height), slice(view.camera.width))
+            grey[part] = view.color.mean(axis=2)
+            if view.mask is not None:
+                masks[part] = np.rint(255 * view.mask)
+        self.grey = torch.from_numpy(grey).to(device)
+        if all(view.mask is not None for view in views):
+            self.masks = torch.from_numpy(masks).to(device)
+
+    def contains(self, view: Tensor, pixels: Tensor, margin: float = 0.0) -> Tensor:
+        """Which pixels ``(..., 2)`` lie in pictures ``(...,)``, at least ``margin`` from the middles of the border."""
+        return ((pixels >= margin) & (pixels <= self.sizes[view] - 1 - margin)).all(dim=-1)
+
+    def at(self, view: Tensor, pixels: Tensor) -> Tensor:
+        """Grey values ``(...,)`` at pixels ``(..., 2)`` of pictures ``(...,)``, bilinear; differentiable in pixels."""
+        _, height, width = self.grey.shape
+        x, y = torch.minimum(pixels.clamp(min=0), (self.sizes[view] - 1).to(pixels)).unbind(dim=-1)
+        # All pictures are one above the other, so that one call samples any of them.
+        atlas = self.grey.reshape(1, 1, -1, width)
+        u = 2 * x / max(width - 1, 1) - 1
+        v = 2 * (view * height + y) / max(atlas.shape[2] - 1, 1) - 1
+        grid = torch.stack((u, v), dim=-1).reshape(1, 1, -1, 2)
+        return torch.nn.functional.grid_sample(atlas, grid, align_corners=True).reshape(x.shape)
+
+    def weights(self, view: Tensor, pixels: Tensor) -> Tensor:
+        """The share of object ``(...,)`` at pixels ``(..., 2)`` int64 within pictures ``(...,)``; 1 without masks."""
+        if self.masks is None:
+            return torch.ones(pixels.shape[:-1], device=pixels.device)
+        x, y = torch.minimum(pixels.clamp(min=0), self.sizes[view] - 1).unbind(dim=-1)
+        return self.masks[view, y, x] / 255
+
+
+def surface_near(
+    field: FieldLike,
+    origins: Tensor,
+    directions: Tensor,
+    depth: Tensor,
+    options: ConsistencyOptions,
+    *,
+    level: int = -1,
+) -> Surface:
+    """The surface on rays ``(R, 3)`` near a first guess of its ``depth`` ``(R,)``, by Newton's method.
+
+    As in `sphere_trace`, dt = −(df + ⟨∇f, do + t dd⟩) / ⟨∇f, d⟩ gives the derivatives of depths. Normals have those of
+    the place and of the field. Nothing is read by the host.
+    """
+    field = as_field(field)
+    with torch.no_grad():
+        for _ in range(options.newton):
+            jet = field.jet(origins + depth[:, None] * directions, level=level)
+            slope = _falling((jet.gradient * directions).sum(dim=1))
+            depth = depth - jet.value / slope
+        jet = field.jet(origins + depth[:, None] * directions, level=level)
+        slope = (jet.gradient * directions).sum(dim=1)
+        length = jet.gradient.norm(dim=1)
+        found = (jet.value.abs() < options.residual * length) & (slope < -options.facing * length) & (depth > 0)
+        slope = _falling(slope)
+    value = field.value(origins + depth[:, None] * directions, level=level)
+    depth = depth - (value - value.detach()) / slope
+    position = origins + depth[:, None] * directions
+    normal = torch.nn.functional.normalize(field.jet(position, level=level).gradient, dim=1)
+    return Surface(position, normal, found & (position.detach().norm(dim=1) < 1))
+
+
+def _falling(slope: Tensor) -> Tensor:
+    """Slopes that a step may be divided by: a field falls along a ray that enters its surface."""
+    return slope.clamp(max=-0.1)
+
+
+@torch.no_grad()
+def choose_neighbours(
+    surface: Surface,
+    view: Tensor,
+    cameras: Cameras,
+    pictures: GreyPictures,
+    distance: Callable[[Tensor], Tensor],
+    options: ConsistencyOptions,
+) -> tuple[Tensor, Tensor]:
+    """Photographs ``(R, K)`` that a patch around each surface point is compared with, and a mask of those that see it.
+
+    They see the point from another direction than the photograph ``view`` ``(R,)``, by 5° to 25°; those nearest to 12°
+    are taken. ``distance`` is a signed distance, for example a `ValueGrid`, along which rays to them are marched.
+    """
+    away = cameras.eyes - surface.position[:, None]  # (R, V, 3)
+    towards = torch.nn.functional.normalize(away, dim=2)
+    own = towards.gather(1, view[:, None, None].expand(-1, 1, 3))
+    angle = torch.rad2deg((towards * own).sum(dim=2).clamp(-1, 1).acos())
+    pixels, ahead = _projected(surface.position[:, None], cameras)
+    every = torch.arange(len(cameras.eyes), device=view.device).expand_as(angle)
+    fit = (angle >= options.least_angle) & (angle <= options.most_angle) & (ahead > 0)
+    fit &= ((towards * surface.normal[:, None]).sum(dim=2) > options.facing) & surface.found[:, None]
+    fit &= pictures.contains(every, pixels, options.reach)
+    rank = torch.where(fit, (angle - options.usual_angle).abs(), math.inf)
+    rank, chosen = rank.topk(min(options.neighbours, rank.shape[1]), dim=1, largest=False)
+    visible = rank < math.inf
+    along = towards.gather(1, chosen[:, :, None].expand(-1, -1, 3))
+    reached = torch.full_like(rank, options.clearance)
+    for _ in range(options.marches):
+        value = distance(surface.position[:, None] + reached[..., None] * along)
+        visible &= value > 0
+        reached = reached + value.clamp(min=options.stride)
+    return chosen, visible
+
+
+def _projected(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Pixels ``(R, V, 2)`` and depths ``(R, V)`` of points ``(R, 1, 3)`` in all cameras."""
+    seen = torch.einsum("rvi,vij->rvj", points - cameras.eyes, cameras.axes)
+    depth = seen[..., 2]
+    slopes = seen[..., :2] / torch.where(depth > 0, depth, 1.0)[..., None]
+    return slopes * cameras.lens[:, :2] + cameras.lens[:, 2:], depth
+
+
+def warp(surface: Surface, pixels: Pixels, offsets: Tensor, neighbours: Tensor, cameras: Cameras) -> Tensor:
+    """Where patches fall in other photographs if the surface is its tangent plane: ``(R, K, P, 2)`` pixels.
+
+    The patch of a pixel is itself plus ``offsets`` ``(P, 2)``; ``neighbours`` are ``(R, K)`` numbers of pictures. With
+    the point X and the normal n in the camera's axes, the homography is K' (R' + t' nᵀ / ⟨n, X⟩) K⁻¹ (Hartley and
+    Zisserman 2003, Eq. 13.2).
+    """
+    eyes, axes, lens = (part[pixels.view] for part in cameras)
+    lines = (pixels.place[:, None] + offsets - lens[:, None, 2:]) / lens[:, None, :2]  # (R, P, 2)
+    lines = torch.cat((lines, torch.ones_like(lines[..., :1])), dim=2)
+    normal = torch.einsum("ri,rij->rj", surface.normal, axes)
+    place = torch.einsum("ri,rij->rj", surface.position - eyes, axes)
+    height = (normal * place).sum(dim=1, keepdim=True)
+    there = cameras.axes[neighbours]  # (R, K, 3, 3)
+    turn = torch.einsum("rkij,ril->rkjl", there, axes)
+    shift = torch.einsum("rkij,rki->rkj", there, eyes[:, None] - cameras.eyes[neighbours])
+    plane = turn + shift[..., None] * (normal / height)[:, None, None]
+    seen = torch.einsum("rkij,rpj->rkpi", plane, lines)
+    depth = seen[..., 2:]
+    lens = cameras.lens[neighbours][:, :, None]
+    return seen[..., :2] / torch.where(depth > 1e-3, depth, 1.0) * lens[..., :2] + lens[..., 2:]
+
+
+def correlation(first: Tensor, second: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Normalised cross-correlation of patches ``(..., P)`` with ``weights``, and the smaller standard deviation."""
+    weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6)
+
+    def moment(a: Tensor, b: Tensor) -> Tensor:
+        return (weights * a * b).sum(dim=-1)
+
+    a, b = (patch - (weights * patch).sum(dim=-1, keepdim=True) for patch in (first, second))
+    # A patch without texture counts nothing; the bound keeps its derivatives finite.
+    variances = [moment(patch, patch).clamp(min=1e-8) for patch in (a, b)]
+    return moment(a, b) / (variances[0] * variances[1]).sqrt(), torch.minimum(*variances).detach().sqrt()
+
+
+def consistency_loss(
+    surface: Surface,
+    pixels: Pixels,
+    cameras: Cameras,
+    pictures: GreyPictures,
+    distance: Callable[[Tensor], Tensor],
+    options: ConsistencyOptions,
+) -> Tensor:
+    """Σ (1 − NCC) / n of the n best neighbours of each pixel ``(R,)``; what does not count adds 0.
+
+    A neighbour counts that sees the point (see `choose_neighbours`), holds the whole patch, has texture there, and
+    whose correlation is not below the floor. With masks, pixels of a patch weigh as much as they are object.
+    """
+    span = torch.arange(-options.reach, options.reach + 1, device=pixels.view.device)
+    offsets = torch.cartesian_prod(span, span)
+    chosen, visible = choose_neighbours(surface, pixels.view, cameras, pictures, distance, options)
+    own = pixels.place[:, None] + offsets
+    view = pixels.view[:, None].expand(own.shape[:2])
+    inside = pictures.contains(view, own).all(dim=1)
+    patch, weights = pictures.at(view, own.to(surface.position)), pictures.weights(view, own)
+    warped = warp(surface, pixels, offsets, chosen, cameras)
+    there = chosen[:, :, None].expand(warped.shape[:3])
+    alike, texture = correlation(patch[:, None], pictures.at(there, warped), weights[:, None])
+    counts = visible & inside[:, None] & pictures.contains(there, warped.detach()).all(dim=2)
+    counts &= (texture > options.texture) & (alike.detach() > options.floor)
+    best, row = torch.where(counts, alike, -1.0).topk(min(options.best, alike.shape[1]), dim=1)
+    return torch.where(counts.gather(1, row), 1 - best, 0.0).sum(dim=1) / best.shape[1]
