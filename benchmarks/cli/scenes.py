@@ -131,6 +131,30 @@ def _consistency(arguments: argparse.Namespace) -> int:
     return run_benches(arguments, [bench], out=arguments.out)
 
 
+FAULTS = ("poses", "pose", "image", "mirrored", "masks", "holes", "exposure")
+
+
+def _fault_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("photos", metavar="DATA", help="posed photographs, three or more")
+    parser.add_argument("fault", choices=FAULTS, metavar="FAULT", help=", ".join(FAULTS))
+    add_flags(parser, "--out", metavar="DIR", help="a folder that is not there yet")
+    add_flags(parser, "--seed", help="of the fault (0)")
+
+
+def _fault(arguments: argparse.Namespace) -> int:
+    from mplicits.datasets import read_posed_images, write_neus
+    from mplicits.datasets.views.writing import check_new_folder
+
+    from ..scenes.view_faults import with_fault
+
+    folder, images = check_new_folder(arguments.out), read_posed_images(arguments.photos)
+    if len(images.views) < 3:
+        raise input_error(f"{arguments.photos}: {len(images.views)} photographs; the third has the fault, so give more")
+    write_neus(folder, with_fault(images, arguments.fault, arguments.seed))
+    print(f"{folder}: {len(images.views)} photographs with the fault {arguments.fault!r}")
+    return 0
+
+
 FROM_CASES = ("kind", "shapes", "times", "velocity", "axis", "center", "angle", "twist", "alpha")
 
 
@@ -267,6 +291,15 @@ SCENES: Mapping[str, Command] = MappingProxyType(
             _consistency,
             "Train on photographs of an exact scene without and with the comparison of neighbouring photographs: "
             "accuracy, completeness, flat walls, edges, held-out views, seconds and memory.",
+        ),
+        "fault": Command(
+            "posed photographs with something wrong",
+            """  mplicits scene figure -o figure --views 40
+  python -m benchmarks fault figure poses -o unsharp""",
+            _fault_arguments,
+            _fault,
+            "Make one thing wrong with posed photographs, to see what `check-cameras` says of it and what a training "
+            "survives; written in the format of NeuS.",
         ),
         "evolve": Command(
             "surfaces that move: exact cases, and morphs of meshes",

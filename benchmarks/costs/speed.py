@@ -43,6 +43,16 @@ from ..harness.tables import Column, Figure, Table, tabulated
 SIZES = ((128, 2), (256, 2), (400, 2), (256, 3))
 
 
+@contextmanager
+def operations_split() -> Iterator[None]:
+    """Blocks in turn, each operation split among all threads."""
+    token = split_operations.set(True)
+    try:
+        yield
+    finally:
+        split_operations.reset(token)
+
+
 @dataclass(frozen=True)
 class NormalsRow:
     """Seconds for one network on one set of points.
@@ -122,7 +132,7 @@ class NormalsBench(Benchmark[NormalsRow]):
         threads = torch.get_num_threads()
         with torch.inference_mode():
             value, jet = seconds(network.value), seconds(network.jet)
-            with split_operations():
+            with operations_split():
                 value_split, jet_split = seconds(network.value), seconds(network.jet)
             with one_thread():
                 value_one, jet_one = seconds(network.value), seconds(network.jet)

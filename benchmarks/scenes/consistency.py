@@ -118,8 +118,8 @@ class ConsistencyBench(Benchmark[ConsistencyRow]):
         visible = evaluate_surfaces(mesh, truth, samples=self.eval_samples, view_counts=counts).visible
         assert visible is not None
         rough = surface_roughness(mesh, truth, samples=self.eval_samples, seed=config.seed)
-        accuracy, completeness, _ = visible.distances
-        floor = visible.distances_floor.overall
+        accuracy, completeness = visible.distances.accuracy, visible.distances.completeness
+        floor = visible.floors.overall
         if accuracy is None or completeness is None or floor is None:
             raise InputError(f"{job.name}: no photograph sees the surface; give more --views")
         return [

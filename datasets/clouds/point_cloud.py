@@ -175,20 +175,6 @@ def spacing_of(points: Float64, *, share: float = 0.95, sample: int = 20_000) ->
     return float(np.quantile(KDTree(shifted).query(asked, k=2)[0][:, 1], share))
 
 
-def weld(vertices: Float64) -> tuple[Int64, Int64]:
-    """The first of each set of equal rows of ``vertices`` ``(N, K)``: indices ``(M,)``, rows in ascending order.
-
-    The second result is the place of each old row among them ``(N,)``.
-    """
-    order = np.lexsort((vertices + 0.0).T)  # stable: among equals the first comes first; + 0.0: minus zero is zero
-    ordered = vertices[order]
-    first = np.ones(len(vertices), bool)
-    first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
-    index = np.empty(len(vertices), np.int64)
-    index[order] = np.cumsum(first) - 1
-    return order[first], index
-
-
 def spread_on_faces(areas: Float64, count: int, rng: np.random.Generator) -> tuple[Int64, Float64]:
     """Places uniform by area: their faces ``(count,)``, ascending, and weights ``(count, 3)`` of the faces' corners.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,16 +15,22 @@ from .solids import Vector
 
 Float64 = NDArray[np.float64]
 
-CENTER: Vector = (0.0, 0.0, 0.0)
-TURN: Vector = (0.06, 0.2, 0.03)  # radians; marching cubes would be exact on faces along the axes
-CRATE: Vector = (0.26, -0.21, 0.05)
-CRATE_TURN: Vector = (0.0, 0.6, 0.0)
-BOWL: Vector = (-0.26, -0.13, 0.1)  # middle of the sphere that is taken from its block
-ROD_RADIUS = 0.012
-PAINT = (0.58, 0.52, 0.45)
-PLAIN = 0.3  # the wall right of this has no texture
-# Of the texture: octaves, points along a lattice, cells of the finest in radii of the region, and contrast.
-OCTAVES, LATTICE, FINEST, CONTRAST = 6, 32, 0.006, 0.5
+
+@dataclass(frozen=True)
+class Corner:
+    """Where its parts stand, in radii of the region and radians, and the noise of its texture."""
+
+    turn: Vector = (0.06, 0.2, 0.03)  # marching cubes would be exact on faces along the axes
+    crate: Vector = (0.26, -0.21, 0.05)
+    bowl: Vector = (-0.26, -0.13, 0.1)  # middle of the sphere that is taken from its block
+    plain: float = 0.3  # the wall right of this has no texture
+    octaves: int = 6
+    lattice: int = 32  # points along a side, then the noise repeats
+    finest: float = 0.006  # cell of the finest octave
+    contrast: float = 0.5
+
+
+CORNER = Corner()
 
 
 def corner(p: Tensor) -> Tensor:
@@ -30,14 +38,14 @@ def corner(p: Tensor) -> Tensor:
 
     Exact outside, but for the bowl, where it is a bound. The rod has a radius of 0.012, the crate edges of 0.32.
     """
-    q = solids.tilt(p.reshape(-1, 3), CENTER, TURN)
+    q = solids.tilt(p.reshape(-1, 3), (0.0, 0.0, 0.0), CORNER.turn)
     block = solids.rounded_box(q, (-0.26, -0.25, 0.1), (0.17, 0.12, 0.17), 0.0)
     parts = [
         solids.rounded_box(q, (0.0, 0.05, -0.36), (0.6, 0.43, 0.06), 0.0),
         solids.rounded_box(q, (0.0, -0.4, 0.0), (0.6, 0.04, 0.42), 0.0),
-        solids.rounded_box(solids.tilt(q, CRATE, CRATE_TURN), CRATE, (0.16, 0.16, 0.16), 0.0),
-        torch.maximum(block, -solids.ellipsoid(q, BOWL, (0.13, 0.13, 0.13))),
-        solids.round_cone(q, (-0.02, -0.4, 0.26), (0.04, 0.3, 0.16), ROD_RADIUS, ROD_RADIUS),
+        solids.rounded_box(solids.tilt(q, CORNER.crate, (0.0, 0.6, 0.0)), CORNER.crate, (0.16, 0.16, 0.16), 0.0),
+        torch.maximum(block, -solids.ellipsoid(q, CORNER.bowl, (0.13, 0.13, 0.13))),
+        solids.round_cone(q, (-0.02, -0.4, 0.26), (0.04, 0.3, 0.16), 0.012, 0.012),
     ]
     return torch.stack(parts).amin(dim=0).reshape(p.shape[:-1])
 
@@ -48,14 +56,15 @@ def corner_colors(points: Float64) -> Float64:
     Each octave is a cubic B-spline over random numbers on a lattice of its own direction (Perlin 1985).
     """
     sums = np.zeros_like(points)
-    for octave in range(OCTAVES):
+    for octave in range(CORNER.octaves):
         random = np.random.default_rng(octave)
         axes = np.linalg.qr(random.normal(size=(3, 3)))[0]
-        grey, hue = random.normal(size=(LATTICE,) * 3), random.normal(size=(3, *(LATTICE,) * 3))
-        places = (points @ axes / (FINEST * 2**octave)).T
+        grey, hue = random.normal(size=(CORNER.lattice,) * 3), random.normal(size=(3, *(CORNER.lattice,) * 3))
+        places = (points @ axes / (CORNER.finest * 2**octave)).T
         for channel in range(3):
             numbers = grey + 0.4 * hue[channel]
             sums[:, channel] += ndimage.map_coordinates(numbers, places, order=3, mode="grid-wrap", prefilter=False)
-    turned = solids.tilt(torch.from_numpy(points), CENTER, TURN).numpy()
-    plain = (turned[:, 0] > PLAIN) & (turned[:, 2] < -0.29)
-    return np.where(plain[:, None], PAINT, PAINT + 0.4 * np.tanh(CONTRAST * sums))
+    turned = solids.tilt(torch.from_numpy(points), (0.0, 0.0, 0.0), CORNER.turn).numpy()
+    plain = (turned[:, 0] > CORNER.plain) & (turned[:, 2] < -0.29)
+    paint = np.array((0.58, 0.52, 0.45))
+    return np.where(plain[:, None], paint, paint + 0.4 * np.tanh(CORNER.contrast * sums))

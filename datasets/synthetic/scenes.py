@@ -28,8 +28,7 @@ from .statue import Statue
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Rgb = tuple[float, float, float]
-Size = int | tuple[int, int]
-"""Width and height of images in pixels; one number for both."""
+Size = int | tuple[int, int]  # width and height of images in pixels, or one number for both
 
 RAYS_AT_ONCE = 1 << 17
 LAMP = (0.4, 0.7, 0.6)  # towards the lamp, for shaded scenes

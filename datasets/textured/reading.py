@@ -10,7 +10,8 @@ from types import MappingProxyType
 import numpy as np
 
 from ...neural_fields import InputError
-from ..clouds.point_cloud import PointCloud, spread_on_faces, weld
+from ...neural_fields.meshing.mesh import weld
+from ..clouds.point_cloud import PointCloud, spread_on_faces
 from ..clouds.readers.ply import read_ply_mesh
 from ..files import readable
 from .gltf import read_gltf

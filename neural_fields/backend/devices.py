@@ -170,7 +170,7 @@ WANTED_BLOCKS = 8  # that few rows are cut into, where blocks stay at LEAST_ROWS
 LEAST_BLOCKS = 4  # for threads; with fewer, waking them costs more than it saves
 
 
-_split = ContextVar("split", default=False)
+split_operations = ContextVar("split_operations", default=False)  # blocks in turn, operations split among all threads
 _pool: ThreadPoolExecutor | None = None
 _pool_lock = threading.Lock()
 
@@ -244,7 +244,7 @@ class _Blocks:
 def _may_share(like: Tensor) -> bool:
     """Whether other threads may work on this tensor; modes that watch operations watch one thread only."""
     return (
-        not _split.get()
+        not split_operations.get()
         and like.device.type == "cpu"
         and type(like) in (Tensor, torch.nn.Parameter)
         and not torch.compiler.is_compiling()
@@ -266,16 +266,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-@contextmanager
-def split_operations() -> Iterator[None]:
-    """Blocks in turn, each operation split among all threads; for comparisons in benchmarks."""
-    token = _split.set(True)
-    try:
-        yield
-    finally:
-        _split.reset(token)
 
 
 def _helpers() -> ThreadPoolExecutor:

@@ -68,15 +68,10 @@ class Mesh:
     @cached_property
     def merged(self) -> Mesh:
         """Vertices and faces alone, equal vertices made one; faces that collapse by it are dropped."""
-        order = np.lexsort(self.vertices.T[::-1])
-        rows = self.vertices[order]
-        first = np.ones(len(rows), bool)
-        first[1:] = (rows[1:] != rows[:-1]).any(axis=1)
-        index = np.empty(len(rows), np.int64)
-        index[order] = np.cumsum(first) - 1
+        first, index = weld(self.vertices)
         faces = index[self.faces]
         whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-        return Mesh(rows[first], faces[whole])
+        return Mesh(self.vertices[first], faces[whole])
 
     def moved(self, similarity: Similarity) -> Mesh:
         """The same mesh in unit-sphere coordinates."""
@@ -251,25 +246,44 @@ def write_obj(path: Path, mesh: Mesh, *, double: bool, library: str | None = Non
                 file.write((template + "\n") * len(part) % tuple(part.ravel().tolist()))
 
 
+def weld(vertices: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The first of each set of equal rows of ``vertices`` ``(N, K)``: indices ``(M,)``, rows in ascending order.
+
+    The second result is the place of each old row among them ``(N,)``.
+    """
+    order = np.lexsort((vertices + 0.0).T)  # stable: among equals the first comes first; + 0.0: minus zero is zero
+    ordered = vertices[order]
+    first = np.ones(len(vertices), bool)
+    first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    index = np.empty(len(vertices), np.int64)
+    index[order] = np.cumsum(first) - 1
+    return order[first], index
+
+
+def ply_vertices(
+    points: NDArray[Any], normals: NDArray[Any] | None, colors: NDArray[Any] | None, *, double: bool
+) -> tuple[list[str], NDArray[Any]]:
+    """The first lines of the header of a binary PLY, and its rows of points, and of normals and colours ``(N, 3)``."""
+    kind = "<f8" if double else "<f4"
+    columns: list[tuple[str, str, NDArray[Any]]] = [(name, kind, c) for name, c in zip("xyz", points.T, strict=True)]
+    if normals is not None:
+        columns += [(name, "<f4", n) for name, n in zip(("nx", "ny", "nz"), normals.T, strict=True)]
+    if colors is not None:
+        shades = np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
+        columns += [(name, "u1", c) for name, c in zip(("red", "green", "blue"), shades.T, strict=True)]
+    rows = np.empty(len(points), [(name, kind) for name, kind, _ in columns])
+    for name, _, column in columns:
+        rows[name] = column
+    names = {"<f8": "double", "<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", "comment mplicits", f"element vertex {len(rows)}"]
+    return header + [f"property {names[kind]} {name}" for name, kind, _ in columns], rows
+
+
 def _write_ply(path: Path, mesh: Mesh, home: Similarity, placement: Placement) -> None:
     mesh, double = mesh.placed(".ply", home, placement)
-    kind = "<f8" if double else "<f4"
-    columns: list[tuple[str, str, NDArray[Any]]] = [
-        (name, kind, column) for name, column in zip("xyz", mesh.vertices.T, strict=True)
-    ]
-    if mesh.normals is not None:
-        columns += [(name, "<f4", n) for name, n in zip(("nx", "ny", "nz"), mesh.normals.T, strict=True)]
-    if mesh.colors is not None:
-        shades = np.rint(np.clip(mesh.colors, 0, 1) * 255).astype(np.uint8)
-        columns += [(name, "u1", c) for name, c in zip(("red", "green", "blue"), shades.T, strict=True)]
-    vertices = np.empty(len(mesh.vertices), [(name, kind) for name, kind, _ in columns])
-    for name, _, column in columns:
-        vertices[name] = column
+    header, vertices = ply_vertices(mesh.vertices, mesh.normals, mesh.colors, double=double)
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
     faces["count"], faces["index"] = 3, mesh.faces
-    names = {"<f8": "double", "<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", "comment mplicits", f"element vertex {len(vertices)}"]
-    header += [f"property {names[kind]} {name}" for name, kind, _ in columns]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
     with path.open("wb") as file:
         file.write("\n".join(header).encode())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,8 @@ from .common import Command, add_flags, check_output, picture_size, positive, re
 if TYPE_CHECKING:
     from ...datasets.views.poses.find_cameras import FoundCameras
     from ...datasets.views.poses.find_points import FoundPoints
+
+    Found = FoundCameras | FoundPoints
 
 
 def _find_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,19 +32,24 @@ def _find_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _find_cameras(arguments: argparse.Namespace) -> int:
     from ...datasets.views.poses.find_cameras import find_cameras
+
+    find = partial(find_cameras, frames=arguments.frames, lens=arguments.lens)
+    return _find(arguments, arguments.photos, find, command_line("check-cameras", arguments.out, "-o", "cameras.glb"))
+
+
+def _find(arguments: argparse.Namespace, photos: str, find: Callable[..., Found], following: str) -> int:
+    """Find cameras or points and tell of them."""
     from ..reconstruct.check import colmap_report
 
-    out = arguments.out
     with training("the same command continues", quiet=arguments.quiet, at_any_time=True) as report:
-        lens, told = arguments.lens, colmap_report(report)
-        found = find_cameras(arguments.photos, out, frames=arguments.frames, lens=lens, report=told)
+        found = find(photos, arguments.out, report=colmap_report(report))
     tell_found(found)
-    print("next:", command_line("check-cameras", out, "-o", "cameras.glb"))
-    write_json(arguments.json, asdict(found) | {"project": str(out)})
+    print("next:", following)
+    write_json(arguments.json, asdict(found) | {"project": str(arguments.out)})
     return 0
 
 
-def tell_found(found: FoundCameras | FoundPoints) -> None:
+def tell_found(found: Found) -> None:
     """Print what was found, and warn on stderr."""
     from ..reconstruct.check import said_of
 
@@ -72,15 +80,8 @@ def _points_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _find_points(arguments: argparse.Namespace) -> int:
     from ...datasets.views.poses.find_points import find_points
-    from ..reconstruct.check import colmap_report
 
-    out = arguments.out
-    with training("the same command continues", quiet=arguments.quiet, at_any_time=True) as report:
-        found = find_points(arguments.data, out, report=colmap_report(report))
-    tell_found(found)
-    print("next:", command_line("reconstruct", out, "-o", "RUN"))
-    write_json(arguments.json, asdict(found) | {"project": str(out)})
-    return 0
+    return _find(arguments, arguments.data, find_points, command_line("reconstruct", arguments.out, "-o", "RUN"))
 
 
 FIND_POINTS = Command(
@@ -143,7 +144,6 @@ CHECK_CAMERAS = Command(
 
 
 SCENE_NAMES = ("painted-sphere", "striped-torus", "figure", "statue", "corner")
-FAULTS = ("poses", "pose", "image", "mirrored", "masks", "holes", "exposure")
 FORMATS = ("neus", "transforms", "colmap", "colmap-text")
 
 
@@ -163,23 +163,18 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--glossy", action="store_true", help=what)
     what = "write depth maps too, in depths/: what the pixels' centres see, in the units of the cameras"
     parser.add_argument("--depths", action="store_true", help=what)
-    what = "what is wrong with them, to see what is said of it and survived: " + ", ".join(FAULTS)
-    parser.add_argument("--fault", choices=FAULTS, metavar="FAULT", help=what)
     add_flags(parser, "--seed", help="of the cameras (0)")
     parser.add_argument("--up", choices=("y", "z"), metavar="{y,z}", help="the axis of a mesh that points up (y)")
 
 
 def _scene(arguments: argparse.Namespace) -> int:
     from ...datasets.synthetic.scenes import SCENES, render_scene, scene_mesh
-    from ...datasets.synthetic.view_faults import with_fault
     from ...datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
     from ..mesh.files import write_mesh
     from ..render.studio import photograph_mesh, true_mesh
     from ..training.progress import counter_bar
 
     folder = check_new_folder(arguments.out)
-    if arguments.fault and arguments.views < 3:
-        raise input_error("--fault: one of three views at least has it; --views 3 or more")
     name, exact = arguments.name, arguments.name in SCENES
     if not exact and not Path(name).exists():
         raise input_error(f"{name}: neither a mesh file nor one of the scenes {', '.join(SCENE_NAMES)}; check the name")
@@ -193,8 +188,6 @@ def _scene(arguments: argparse.Namespace) -> int:
             truth, images = scene_mesh(scene), render_scene(scene, **given)
         else:
             truth, images = true_mesh(name), photograph_mesh(name, up=arguments.up or "y", **given)
-    if arguments.fault:
-        images = with_fault(images, arguments.fault, arguments.seed)
     text = partial(write_colmap, form="text")
     writers = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap, "colmap-text": text}
     writers[arguments.format](folder, images)
@@ -212,7 +205,6 @@ SCENE = Command(
   mplicits scene statue -o statue --format colmap --shaded
   mplicits scene corner -o corner --views 49 --size 400x300
   mplicits scene figure -o measured --format transforms --depths
-  mplicits scene figure -o unsharp --fault poses
   mplicits scene spot.obj -o spot --format transforms --views 40 --shaded""",
     _scene_arguments,
     _scene,

@@ -36,6 +36,7 @@ class ConsistencyOptions:
     texture: float = 0.02  # standard deviation of a patch's grey values in [0, 1], at least
     floor: float = 0.3  # correlation below which two patches show different things
     newton: int = 2  # steps from the median depth of a rendered ray to the surface
+    least_slope: float = 0.1  # along a ray, by which a step is divided at least: fields fall where a ray enters
     residual: float = 0.002  # distance from the surface after them, at most, in radii of the region
     clearance: float = 0.04  # from which on a ray to a neighbour is tested for occlusion, in radii of the region
     marches: int = 10  # steps of that test
@@ -66,20 +67,16 @@ class Pixels(NamedTuple):
 
 
 class GreyPictures:
-    """Grey values ``(V, H, W)`` of photographs, padded to one size, and their ``masks`` as uint8, if all have one."""
+    """Grey values ``(V, H, W)`` of photographs, padded to one size, and masks as uint8, full without a mask."""
 
     def __init__(self, views: Sequence[PosedImage], device: torch.device) -> None:
         self.sizes = torch.tensor([[view.camera.width, view.camera.height] for view in views], device=device)
         grey, masks = (np.zeros((len(views), *self.sizes.amax(dim=0).tolist()[::-1]), kind) for kind in ("f4", "u1"))
-        self.masks = None
         for index, view in enumerate(views):
             part = (index, slice(view.camera.height), slice(view.camera.width))
             grey[part] = view.color.mean(axis=2)
-            if view.mask is not None:
-                masks[part] = np.rint(255 * view.mask)
-        self.grey = torch.from_numpy(grey).to(device)
-        if all(view.mask is not None for view in views):
-            self.masks = torch.from_numpy(masks).to(device)
+            masks[part] = 255 if view.mask is None else np.rint(255 * view.mask)
+        self.grey, self.masks = torch.from_numpy(grey).to(device), torch.from_numpy(masks).to(device)
 
     def contains(self, view: Tensor, pixels: Tensor, margin: float = 0.0) -> Tensor:
         """Which pixels ``(..., 2)`` lie in pictures ``(...,)``, at least ``margin`` from the middles of the border."""
@@ -98,8 +95,6 @@ class GreyPictures:
 
     def weights(self, view: Tensor, pixels: Tensor) -> Tensor:
         """The share of object ``(...,)`` at pixels ``(..., 2)`` int64 within pictures ``(...,)``; 1 without masks."""
-        if self.masks is None:
-            return torch.ones(pixels.shape[:-1], device=pixels.device)
         x, y = torch.minimum(pixels.clamp(min=0), self.sizes[view] - 1).unbind(dim=-1)
         return self.masks[view, y, x] / 255
 
@@ -122,23 +117,18 @@ def surface_near(
     with torch.no_grad():
         for _ in range(options.newton):
             jet = field.jet(origins + depth[:, None] * directions, level=level)
-            slope = _falling((jet.gradient * directions).sum(dim=1))
+            slope = (jet.gradient * directions).sum(dim=1).clamp(max=-options.least_slope)
             depth = depth - jet.value / slope
         jet = field.jet(origins + depth[:, None] * directions, level=level)
         slope = (jet.gradient * directions).sum(dim=1)
         length = jet.gradient.norm(dim=1)
         found = (jet.value.abs() < options.residual * length) & (slope < -options.facing * length) & (depth > 0)
-        slope = _falling(slope)
+        slope = slope.clamp(max=-options.least_slope)
     value = field.value(origins + depth[:, None] * directions, level=level)
     depth = depth - (value - value.detach()) / slope
     position = origins + depth[:, None] * directions
     normal = torch.nn.functional.normalize(field.jet(position, level=level).gradient, dim=1)
     return Surface(position, normal, found & (position.detach().norm(dim=1) < 1))
-
-
-def _falling(slope: Tensor) -> Tensor:
-    """Slopes that a step may be divided by: a field falls along a ray that enters its surface."""
-    return slope.clamp(max=-0.1)
 
 
 @torch.no_grad()

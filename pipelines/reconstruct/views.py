@@ -88,16 +88,14 @@ def held_out(views: Sequence[PosedImage], every: int) -> tuple[list[PosedImage],
     """The views to train on, and those held out: every n-th, from the first; none for 0, and none of a single view."""
     if every == 0 or len(views) == 1:
         return list(views), []
-    chosen = set(range(0, len(views), max(2, every)))
-    train = [view for index, view in enumerate(views) if index not in chosen]
-    return train, [view for index, view in enumerate(views) if index in chosen]
+    step = max(2, every)
+    return [view for index, view in enumerate(views) if index % step], list(views[::step])
 
 
 def spread(views: Sequence[PosedImage]) -> list[PosedImage]:
     """The views in an order whose first few, however many, are spread over all of them."""
     golden = (5**0.5 - 1) / 2
-    order = sorted(range(len(views)), key=lambda index: index * golden % 1)
-    return [views[index] for index in order]
+    return [views[index] for index in sorted(range(len(views)), key=lambda index: index * golden % 1)]
 
 
 def reduced(view: PosedImage, pixels: int) -> PosedImage:

@@ -25,7 +25,8 @@ ViewCounts = Callable[[Mesh, Float64], Int64]
 """How many photographs see points ``(N, 3)`` of the reference, both in its own coordinates; ``(N,)``."""
 
 
-class Distances(NamedTuple):
+@dataclass(frozen=True)
+class Distances:
     """Mean unsquared distances in INPUT units, as in DTU's evaluation (Jensen et al. 2014); None if nothing is visible.
 
     Attributes:
@@ -41,23 +42,17 @@ class Distances(NamedTuple):
 
 @dataclass(frozen=True)
 class Visible:
-    """Figures of the part of the reference that photographs see: its samples, and those whose nearest one is visible.
+    """Distances where a photograph sees the reference: of its samples there, and of those whose nearest one is there.
 
     Attributes:
-        share: of the reference's area that two photographs or more see.
-        chamfer: as in `Metrics`, where two or more see; None if nothing is visible.
-        chamfer_floor: the same of another sampling of the reference.
-        share_once: of the reference's area that one photograph or more sees.
-        distances: where one or more sees.
-        distances_floor: the same of another sampling of the reference.
+        share: of the reference's area.
+        distances: of the mesh.
+        floors: of another sampling of the reference.
     """
 
     share: float
-    chamfer: float | None
-    chamfer_floor: float | None
-    share_once: float
     distances: Distances
-    distances_floor: Distances
+    floors: Distances
 
 
 @dataclass(frozen=True)
@@ -179,16 +174,9 @@ def evaluate_surfaces(
         again = _ways(sample_points(reference, samples, of_floor)[0], target)
         floor = float(again.there.mean() + again.back.mean())
         if view_counts is not None:
-            counts = view_counts(given, similarity.to_input(target))
-            ways = _Ways(forward**2, np.asarray(nearest), backward**2)
-            visible = Visible(
-                share=float((counts >= 2).mean()),
-                chamfer=_chamfer_where(counts >= 2, ways),
-                chamfer_floor=_chamfer_where(counts >= 2, again),
-                share_once=float((counts >= 1).mean()),
-                distances=_distances_where(counts >= 1, ways, similarity.scale),
-                distances_floor=_distances_where(counts >= 1, again, similarity.scale),
-            )
+            seen = view_counts(given, similarity.to_input(target)) > 0
+            ways = (_Ways(forward**2, np.asarray(nearest), backward**2), again)
+            visible = Visible(float(seen.mean()), *(_distances_where(seen, way, similarity.scale) for way in ways))
         iou, iou_notes = _iou(mesh, reference, columns, closed=closed)
         notes.extend(iou_notes)
     precision, recall = float((forward < threshold).mean()), float((backward < threshold).mean())
@@ -239,11 +227,6 @@ def _ways(a: Float64, b: Float64) -> _Ways:
     return _Ways(np.asarray(forward) ** 2, np.asarray(nearest), np.asarray(backward) ** 2)
 
 
-def _chamfer_where(visible: NDArray[np.bool_], ways: _Ways) -> float | None:
-    there, back = ways.there[visible[ways.nearest]], ways.back[visible]
-    return float(there.mean() + back.mean()) if len(there) and len(back) else None
-
-
 def _distances_where(visible: NDArray[np.bool_], ways: _Ways, scale: float) -> Distances:
     there, back = ways.there[visible[ways.nearest]], ways.back[visible]
     if not (len(there) and len(back)):
@@ -286,12 +269,12 @@ def format_metrics(metrics: Metrics) -> str:
 
     visible = []
     if m.visible is not None:
-        about = f"floor {optional(m.visible.chamfer_floor, '.3e')}; {m.visible.share:.2%} of the area"
-        visible = [("chamfer where 2 photographs see", optional(m.visible.chamfer, ".3e"), about)]
-        floors, names = m.visible.distances_floor, ("mesh → reference", "reference → mesh", "mean of both")
-        about = f"{m.visible.share_once:.2%} of the area; floors {', '.join(optional(f, '.4g') for f in floors)}"
-        visible.append(("distance where 1 sees, input units", "", about))
-        visible += [(f"  {name}", optional(d, ".4g"), "") for name, d in zip(names, m.visible.distances, strict=True)]
+        visible = [("where a photograph sees the reference", "", f"{m.visible.share:.2%} of the area; in its units")]
+        floors = vars(m.visible.floors)
+        visible += [
+            (f"  {name}", optional(distance, ".4g"), f"sampling floor {optional(floors[name], '.4g')}")
+            for name, distance in vars(m.visible.distances).items()
+        ]
     lines = [
         ("chamfer (squared L2, both ways)", f"{m.chamfer:.3e}", f"sampling floor {optional(m.chamfer_floor, '.3e')}"),
         ("  mesh → reference", f"{m.accuracy:.3e}", ""),

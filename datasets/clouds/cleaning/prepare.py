@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ....neural_fields import InputError, Similarity
-from ..point_cloud import Float64, Int64, PointCloud, centred, middle_of, unit_rows, usable_rows, weld
+from ....neural_fields.meshing.mesh import weld
+from ..point_cloud import Float64, Int64, PointCloud, centred, middle_of, unit_rows, usable_rows
 from ..readers.reading import MIN_POINTS
 from .noise import (
     denoise,

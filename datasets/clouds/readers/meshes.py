@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....neural_fields import InputError
+from ....neural_fields.meshing.mesh import weld
 from ...files import decoded
-from ..point_cloud import PointCloud, colors_from, unit_rows, weld
+from ..point_cloud import PointCloud, colors_from, unit_rows
 from .columns import Table, choose_layout, cloud_from
 from .tables import numbers
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ....neural_fields import InputError
 from ....neural_fields.backend.files import write_whole
+from ....neural_fields.meshing.mesh import ply_vertices
 from ..point_cloud import PointCloud
 from .columns import Table, TableStream, choose_layout, cloud_from
 from .meshes import as_mesh, strips, triangulate
@@ -140,20 +141,7 @@ def ply_stream(path: Path, columns: str | None = None) -> TableStream | None:
 
 def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
     """Write ``cloud`` as binary little-endian PLY with double coordinates; an existing file is replaced at the end."""
-    fields = [(name, "<f8") for name in "xyz"]
-    values = list(cloud.points.T)
-    if cloud.normals is not None:
-        fields += [(name, "<f4") for name in ("nx", "ny", "nz")]
-        values += list(cloud.normals.T)
-    if cloud.colors is not None:
-        fields += [(name, "u1") for name in ("red", "green", "blue")]
-        values += list(np.rint(cloud.colors * 255).astype(np.uint8).T)
-    rows = np.empty(len(cloud), np.dtype(fields))
-    for (name, _), column in zip(fields, values, strict=True):
-        rows[name] = column
-    types = {"<f8": "double", "<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
-    header += [f"property {types[kind]} {name}" for name, kind in fields]
+    header, rows = ply_vertices(cloud.points, cloud.normals, cloud.colors, double=True)
     write_whole(path, "\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
 
 

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from mplicits.neural_fields.networks.multiscale import solve_sphere
+from fields import solve_sphere
 from mplicits.pipelines.reconstruct import model as scene_model
 
 from benchmarks.__main__ import main

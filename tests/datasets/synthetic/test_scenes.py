@@ -190,7 +190,7 @@ def test_pictures_that_are_not_square_show_the_whole_corner(size):
 def test_the_corner_has_what_photographs_find_hard():
     """Exact distances to a flat wall, a sharp edge, a thin rod, a crease and a bowl; and a wall without texture."""
     scene = SCENES["corner"]()
-    turn = corner.solids.tilt(torch.eye(3, dtype=torch.float64), corner.CENTER, corner.TURN)  # rows: turned axes
+    turn = corner.solids.tilt(torch.eye(3, dtype=torch.float64), (0, 0, 0), corner.CORNER.turn)  # rows: turned axes
 
     def distance(*places):
         return scene.field.value(torch.tensor(places, dtype=torch.float64) @ turn.T).tolist()
@@ -202,8 +202,8 @@ def test_the_corner_has_what_photographs_find_hard():
     assert distance((-0.26, -0.2, 0.1), (-0.26, -0.17, 0.1)) == pytest.approx([0.06, 0.09])  # in the bowl
     wall = np.random.default_rng(0).uniform((-0.55, -0.3, -0.3), (0.55, 0.4, -0.3), (500, 3))
     colors = scene.color(wall @ turn.numpy().T)
-    assert colors[wall[:, 0] > corner.PLAIN].std(axis=0).max() < 1e-12
-    assert colors[wall[:, 0] < corner.PLAIN].std(axis=0).min() > 0.1
+    assert colors[wall[:, 0] > corner.CORNER.plain].std(axis=0).max() < 1e-12
+    assert colors[wall[:, 0] < corner.CORNER.plain].std(axis=0).min() > 0.1
 
 
 @pytest.mark.parametrize("name", CHEAP)

@@ -10,9 +10,11 @@ import fake_accelerator
 import pytest
 import torch
 from mplicits.neural_fields import Siren
-from mplicits.neural_fields.backend.devices import LEAST_BLOCKS, LEAST_ROWS, one_thread, over_blocks, split_operations
+from mplicits.neural_fields.backend.devices import LEAST_BLOCKS, LEAST_ROWS, one_thread, over_blocks
 from torch import Tensor
 from torch.overrides import BaseTorchFunctionMode
+
+from benchmarks.costs.speed import operations_split
 
 ROWS = LEAST_BLOCKS * LEAST_ROWS  # the fewest that are shared
 
@@ -70,7 +72,7 @@ def test_the_same_bits_for_any_number_of_threads(rows: int, threads: int) -> Non
     network, x = Siren(48, 3, num_features=2), torch.rand(rows, 3)
     found = step_of(network, x)
     # Few rows are left to the operations, which split a product of this size themselves: rounding may differ.
-    with split_operations() if rows < ROWS else one_thread():
+    with operations_split() if rows < ROWS else one_thread():
         expected = step_of(network, x)
     torch.testing.assert_close(found, expected, rtol=0, atol=0)
 

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any, NoReturn
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -114,14 +113,6 @@ def test_an_interruption_of_the_search_says_how_to_go_on(tmp_path, monkeypatch, 
     assert main(f"reconstruct photos -o {tmp_path}/run --poses colmap {TINY}".split()) == 130
     assert "interrupted; the same command continues" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-
-
-def test_a_scene_has_the_fault_that_is_asked_for(tmp_path, capsys):
-    assert main(f"scene figure -o {tmp_path}/right {THREE_VIEWS}".split()) == 0
-    assert main(f"scene figure -o {tmp_path}/wrong {THREE_VIEWS} --fault mirrored".split()) == 0
-    right, wrong = (cv2.imread(str(tmp_path / name / "image" / "000.png")) for name in ("right", "wrong"))
-    assert np.array_equal(wrong, right[:, ::-1])
-    assert "--views 3 or more" in fails(capsys, f"scene figure -o {tmp_path}/few --views 2 --fault image")
 
 
 def test_a_mesh_is_photographed_where_it_is(tmp_path):

@@ -12,7 +12,6 @@ import trimesh
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
-from mplicits.datasets.synthetic.view_faults import with_fault
 from mplicits.datasets.views.images import PosedImage
 from mplicits.datasets.views.writing import write_colmap, write_neus, write_transforms
 from mplicits.neural_fields import Similarity
@@ -23,6 +22,8 @@ from mplicits.pipelines.reconstruct.frustums import camera_mesh, frustum_size
 from mplicits.pipelines.reconstruct.hull import Agreement
 from mplicits.pipelines.surface.surface import read_surface
 from reconstructions import painted_sphere, with_views, without
+
+from benchmarks.scenes.view_faults import with_fault
 
 WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}
 VIEWS = 10  # of the figure with depth maps

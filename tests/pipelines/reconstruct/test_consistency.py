@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from fields import solve_sphere
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.views.images import PosedImage
 from mplicits.neural_fields import Field, FunctionField, MultiscaleSDF, sphere_trace
-from mplicits.neural_fields.networks.multiscale import solve_sphere
 from mplicits.pipelines.reconstruct.consistency import (
     Cameras,
     ConsistencyOptions,

@@ -13,7 +13,6 @@ from fits import assert_same, interrupt
 from mplicits.datasets import read_cloud
 from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, sample_scene
-from mplicits.datasets.synthetic.view_faults import with_fault
 from mplicits.datasets.views.images import PosedImage, PosedImages
 from mplicits.datasets.views.writing import write_neus, write_transforms
 from mplicits.neural_fields import ColorNetwork, InputError, Similarity, Sphere, extract_mesh, load_field
@@ -29,6 +28,8 @@ from mplicits.pipelines.training.trainer import Interrupted, Progress
 from reconstructions import TINY_SCENE, painted_sphere, small_reconstructions, with_views, without
 from safetensors.torch import load_file
 from torch import Tensor
+
+from benchmarks.scenes.view_faults import with_fault
 
 WORLD = Similarity(center=(120.0, -30.0, 8.0), scale=5.0)
 TINY = replace(TINY_SCENE, starts=(0.0, 0.4), steps=40, rays=16, start="sphere", texture_steps=3, test_every=3)

@@ -314,11 +314,11 @@ def test_evaluate_tells_how_near_the_mesh_is_where_photographs_see(
     assert "chamfer where 2 photographs see" in capsys.readouterr().out
     # A camera at four radii sees where the cosine is above 1 / 4; some 40 samples of 2000 are beside a rim.
     eyes = torch.stack([torch.nn.functional.normalize(view.camera.eye, dim=0) for view in images.views])
-    twice = ((fibonacci_directions(20_000) @ eyes.T.numpy() > 0.25).sum(axis=1) >= 2).mean()
+    once = (fibonacci_directions(20_000) @ eyes.T.numpy() > 0.25).any(axis=1).mean()
     visible = json.loads(figures.read_text())["visible"]
-    assert visible["share"] == pytest.approx(twice, abs=0.05)
+    assert visible["share"] == pytest.approx(once, abs=0.05)
     # The mesh is the reference: its distances are those of a sampling.
-    assert visible["distances"] == pytest.approx(visible["distances_floor"], rel=0.1)
+    assert visible["distances"] == pytest.approx(visible["floors"], rel=0.1)
     np.savetxt(cloud, np.random.default_rng(0).normal(size=(50, 3)))
     assert main(["evaluate", str(truth), str(cloud), *some]) == 2
     assert f"{cloud}: holds points" in capsys.readouterr().err

@@ -246,7 +246,7 @@ def test_what_no_photograph_sees_does_not_count():
     def view_counts(mesh: Mesh, points: np.ndarray) -> np.ndarray:
         assert mesh is truth
         counted.append(points)
-        return np.where(points[:, 0] < 0.49, 5, 1)
+        return np.where(points[:, 0] < 0.49, 1, 0)
 
     metrics = evaluate_surfaces(half, truth, samples=4000, view_counts=view_counts)
     assert np.allclose(counted[0][:, 2], 3.0)  # in the reference's own coordinates
@@ -254,15 +254,16 @@ def test_what_no_photograph_sees_does_not_count():
     # The missing half is up to 1/2 away, in units of the square's radius 1/√2: half has a mean of 2 (1/2)² / 3.
     assert metrics.completeness == pytest.approx(0.5 * 0.5**2 / 3 * 2, rel=0.1)
     # Samples of half a square are twice as dense as those of a whole one, so both are within two of its floors.
-    assert metrics.visible.chamfer < 2 * metrics.chamfer_floor
-    # Two photographs see the half, and one sees the rest, whose mean distance is 1/4 in the square's own units.
-    accuracy, completeness, overall = metrics.visible.distances
-    assert metrics.visible.share_once == 1
-    assert completeness == pytest.approx(0.5 * 0.25, rel=0.1)
-    assert accuracy < 1.5 * metrics.visible.distances_floor.accuracy
-    assert overall == pytest.approx((accuracy + completeness) / 2)
+    found, floors = metrics.visible.distances, metrics.visible.floors
+    assert found.accuracy < 1.5 * floors.accuracy
+    assert found.completeness < 1.5 * floors.completeness
+    assert found.overall == pytest.approx((found.accuracy + found.completeness) / 2)
+    whole = evaluate_surfaces(half, truth, samples=4000, view_counts=lambda _, points: np.ones(len(points), int))
+    # Where one photograph sees the rest too: its mean distance is 1/4, in the square's own units.
+    assert whole.visible.share == 1
+    assert whole.visible.distances.completeness == pytest.approx(0.5 * 0.25, rel=0.1)
     unseen = evaluate_surfaces(half, truth, samples=100, view_counts=lambda _, points: np.zeros(len(points), int))
-    assert unseen.visible.distances == (None, None, None)
-    assert "chamfer where 2 photographs see" in measure.format_metrics(metrics)
+    assert unseen.visible.distances == measure.Distances(None, None, None)
+    assert "where a photograph sees" in measure.format_metrics(metrics)
     with pytest.raises(ValueError, match="view_counts"):
         evaluate_surfaces(truth, Mesh(truth.vertices, truth.faces[:0]), samples=10, view_counts=view_counts)

@@ -1,15 +1,19 @@
 """One fault at a time, exactly as it says, and nothing else."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
-from mplicits.datasets.synthetic.view_faults import VIEW_FAULTS, with_fault
-from mplicits.datasets.views.images import PosedImages
+from mplicits.datasets.views.images import PosedImages, read_posed_images
+from mplicits.datasets.views.writing import write_neus
 from mplicits.neural_fields import Similarity
 from mplicits.neural_fields.meshing.color_space import srgb_to_linear
+
+from benchmarks.cli import main
+from benchmarks.scenes.view_faults import VIEW_FAULTS, with_fault
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +90,17 @@ def test_two_views_are_too_few_and_unknown_faults_are_refused(images: PosedImage
         with_fault(replace(images, views=images.views[:2]), "image")
     with pytest.raises(KeyError):
         with_fault(images, "rain")
+
+
+def test_the_command_makes_a_fault_of_a_data_set_and_refuses_what_is_too_small(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for views in (3, 2):
+        write_neus(tmp_path / f"{views}", render_scene(SCENES["painted-sphere"](), views=views, size=24, samples=1))
+    assert main(["fault", f"{tmp_path}/3", "mirrored", "-o", f"{tmp_path}/wrong"]) == 0
+    right, wrong = (read_posed_images(tmp_path / name).views for name in ("3", "wrong"))
+    assert all(np.array_equal(b.color, a.color[:, ::-1]) for a, b in zip(right, wrong, strict=True))
+    capsys.readouterr()
+    assert main(["fault", f"{tmp_path}/2", "mirrored", "-o", f"{tmp_path}/none"]) == 2
+    assert f"{tmp_path}/2: 2 photographs" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()

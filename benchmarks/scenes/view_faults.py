@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from mplicits.datasets.views.formats.shots import DepthMap
+from mplicits.datasets.views.images import PosedImage, PosedImages
+from mplicits.neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from scipy.spatial.transform import Rotation
-
-from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
-from ..views.formats.shots import DepthMap
-from ..views.images import PosedImage, PosedImages
 
 
 def with_fault(images: PosedImages, fault: str, seed: int = 0) -> PosedImages:
