@@ -362,7 +362,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         points, normals = self.points[~self.held], self.normals[~self.held]
         if not config.between:
             return CloudDistance(points, normals, noise=noise, guessed=guessed)
-        omega = max(map(self.omega, range(config.num_levels)))
+        omega = max(config.omegas)
         about = {"noise": noise, "guessed": guessed, "seed": config.seed}
         return dense_distance(points, normals, omega=omega, count=self.filling, **about)
 
