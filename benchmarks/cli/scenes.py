@@ -297,8 +297,8 @@ SCENES: Mapping[str, Command] = MappingProxyType(
             "  python -m benchmarks fault figure poses -o unsharp",
             _fault_arguments,
             _fault,
-            "Make one thing wrong with posed photographs (`mplicits scene` draws some), to see what `check-cameras` says of "
-            "it and what a training survives; written in the format of NeuS.",
+            "Make one thing wrong with posed photographs (`mplicits scene` draws some), to see what `check-cameras` "
+            "says of it and what a training survives; written in the format of NeuS.",
         ),
         "evolve": Command(
             "surfaces that move: exact cases, and morphs of meshes",

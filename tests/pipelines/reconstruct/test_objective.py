@@ -35,7 +35,7 @@ def images() -> PosedImages:
 
 
 def make(images: PosedImages, config: ReconstructConfig, *, depths: bool = False) -> Trainer[SceneObjective]:
-    """A training, with the terms of measured depths and of consistency where they are asked for."""
+    """A training, with the terms of measured depths and of consistency that are wanted."""
     pool = RayPool(images.views, images.similarity, torch.device("cpu"))
     measured = MeasuredDepths(images.views, images, pool.device) if depths else None
     scene = build_scene(config, has_masks=pool.has_masks, views=len(images.views))
