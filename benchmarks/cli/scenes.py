@@ -29,7 +29,7 @@ GEOMETRIES = ("multiscale", "neus", "single")  # those of `bench.geometries`
 
 
 def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
-    what = "an exact scene (painted-sphere, striped-torus, figure, statue, corner), or the path of posed photographs"
+    what = f"an exact scene ({', '.join(SCENE_NAMES)}), or the path of posed photographs"
     parser.add_argument("scenes", nargs="+", metavar="SCENE", help=what)
     folder_flag(parser)
     number(parser, "--views", whole(2, 10_000), 24, "of an exact scene")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ class Corner:
 
 
 CORNER = Corner()
+turned = partial(solids.tilt, center=(0.0, 0.0, 0.0), angles=CORNER.turn)  # points (N, 3) in the axes of wall and floor
 
 
 def corner(p: Tensor) -> Tensor:
@@ -38,7 +40,7 @@ def corner(p: Tensor) -> Tensor:
 
     Exact outside, but for the bowl, where it is a bound. The rod has a radius of 0.012, the crate edges of 0.32.
     """
-    q = solids.tilt(p.reshape(-1, 3), (0.0, 0.0, 0.0), CORNER.turn)
+    q = turned(p.reshape(-1, 3))
     block = solids.rounded_box(q, (-0.26, -0.25, 0.1), (0.17, 0.12, 0.17), 0.0)
     parts = [
         solids.rounded_box(q, (0.0, 0.05, -0.36), (0.6, 0.43, 0.06), 0.0),
@@ -64,7 +66,7 @@ def corner_colors(points: Float64) -> Float64:
         for channel in range(3):
             numbers = grey + 0.4 * hue[channel]
             sums[:, channel] += ndimage.map_coordinates(numbers, places, order=3, mode="grid-wrap", prefilter=False)
-    turned = solids.tilt(torch.from_numpy(points), (0.0, 0.0, 0.0), CORNER.turn).numpy()
-    plain = (turned[:, 0] > CORNER.plain) & (turned[:, 2] < -0.29)
+    right, _, front = turned(torch.from_numpy(points)).numpy().T
+    plain = (right > CORNER.plain) & (front < -0.29)
     paint = np.array((0.58, 0.52, 0.45))
     return np.where(plain[:, None], paint, paint + 0.4 * np.tanh(CORNER.contrast * sums))

@@ -355,16 +355,15 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         Level 0 is not judged, so no point is held out of it: a small face may lie in a single voxel.
         """
         config, all_points = self.config, self.points.numpy()
-        noise, guessed = self.cloud.noise, self.cloud.estimated
+        about: dict[str, Any] = {"noise": self.cloud.noise, "guessed": self.cloud.estimated}
         self.spacing = spacing_of(all_points.astype(np.float64))
         share = config.hold_out if level and self.cloud.noisy is None else 0.0
         self.held = torch.from_numpy(held_out(all_points, self.spacing, share, seed=config.seed))
         points, normals = self.points[~self.held], self.normals[~self.held]
         if not config.between:
-            return CloudDistance(points, normals, noise=noise, guessed=guessed)
-        omega = max(config.omegas)
-        about = {"noise": noise, "guessed": guessed, "seed": config.seed}
-        return dense_distance(points, normals, omega=omega, count=self.filling, **about)
+            return CloudDistance(points, normals, **about)
+        about |= {"omega": max(config.omegas), "count": self.filling, "seed": config.seed}
+        return dense_distance(points, normals, **about)
 
     def next_band(self) -> Band:
         """The band around the last frozen level (Eq. 5), no wider than the one before."""

@@ -1,8 +1,8 @@
 """Multi-view consistency: patches of neighbouring photographs, warped by the surface's tangent planes, correlate.
 
 Two photographs that show the same texture place a surface to a fraction of a pixel. A pixel's surface point and normal
-give a tangent plane. If it is right, its homography maps the patch around the pixel onto the same patch of a neighbour
-(Goesele et al. 2007; for neural surfaces Fu et al., "Geo-Neus", 2022).
+give a tangent plane. If it is right, its homography maps the patch around the pixel onto the same patch of a neighbour.
+Sources: Goesele et al. 2007; for neural surfaces Fu et al., "Geo-Neus", 2022.
 """
 
 from __future__ import annotations
@@ -178,8 +178,8 @@ def warp(surface: Surface, pixels: Pixels, offsets: Tensor, neighbours: Tensor, 
     """Where patches fall in other photographs if the surface is its tangent plane: ``(R, K, P, 2)`` pixels.
 
     The patch of a pixel is itself plus ``offsets`` ``(P, 2)``; ``neighbours`` are ``(R, K)`` numbers of pictures. With
-    the point X and the normal n in the camera's axes, the homography is K' (R' + t' nᵀ / ⟨n, X⟩) K⁻¹ (Hartley and
-    Zisserman 2003, Eq. 13.2).
+    the point X and the normal n in the camera's axes, the homography is K' (R' + t' nᵀ / ⟨n, X⟩) K⁻¹. See Hartley and
+    Zisserman 2003, Eq. 13.2.
     """
     eyes, axes, lens = (part[pixels.view] for part in cameras)
     lines = (pixels.place[:, None] + offsets - lens[:, None, 2:]) / lens[:, None, :2]  # (R, P, 2)

@@ -93,8 +93,7 @@ class SceneObjective(Objective):
                 )
             )
         super().__init__(model, groups, torch.Generator().manual_seed(config.seed))
-        self.model, self.pool, self.config = model, pool, config
-        self.pictures = pictures if config.consistency else None
+        self.model, self.pool, self.config, self.pictures = model, pool, config, pictures
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
         # Recent values, on the CPU, which reads them: samples evaluated per ray, and the surface's uncertainty.
         self.kept["lately"] = torch.tensor([0.0, 1 / float(model.inv_std.detach())])

@@ -175,8 +175,8 @@ def solve_sphere(network: Siren, radius: float = 0.5) -> None:
     """A SIREN of units 1 becomes |x| − radius on the unit ball by one linear solve, and no random numbers.
 
     The first layer is scaled to low phases. The output's weights w and bias b minimise the sum over n points of
-    (w·h(x) + b − |x| + r)² + 0.1 |Jᵀw − x / |x||², and 1e-6 n |w|²: h are the last sines, J is their Jacobian. At
-    (128, 4) and ω₀ = 10 the values are off by 0.01 and the slopes by 0.1.
+    (w·h(x) + b − |x| + r)² + 0.1 |Jᵀw − x / |x||², and 1e-6 n |w|². Here h are the last sines, and J is their Jacobian.
+    At (128, 4) and ω₀ = 10 the values are off by 0.01 and the slopes by 0.1.
     """
     first, width, generator = network.layers[0], network.width, torch.Generator().manual_seed(0)
     first.weight.mul_(1.7 / (3**0.5 * network.omega) / first.weight.double().square().mean().sqrt())

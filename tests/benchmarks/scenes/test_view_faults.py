@@ -13,6 +13,7 @@ from mplicits.neural_fields import Similarity
 from mplicits.neural_fields.meshing.color_space import srgb_to_linear
 
 from benchmarks.cli import main
+from benchmarks.cli.scenes import FAULTS
 from benchmarks.scenes.view_faults import VIEW_FAULTS, with_fault
 
 
@@ -90,6 +91,7 @@ def test_two_views_are_too_few_and_unknown_faults_are_refused(images: PosedImage
         with_fault(replace(images, views=images.views[:2]), "image")
     with pytest.raises(KeyError):
         with_fault(images, "rain")
+    assert set(FAULTS) == set(VIEW_FAULTS)  # what the command offers
 
 
 def test_the_command_makes_a_fault_of_a_data_set_and_refuses_what_is_too_small(

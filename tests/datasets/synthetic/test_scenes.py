@@ -190,7 +190,7 @@ def test_pictures_that_are_not_square_show_the_whole_corner(size):
 def test_the_corner_has_what_photographs_find_hard():
     """Exact distances to a flat wall, a sharp edge, a thin rod, a crease and a bowl; and a wall without texture."""
     scene = SCENES["corner"]()
-    turn = corner.solids.tilt(torch.eye(3, dtype=torch.float64), (0, 0, 0), corner.CORNER.turn)  # rows: turned axes
+    turn = corner.turned(torch.eye(3, dtype=torch.float64))  # rows: turned axes
 
     def distance(*places):
         return scene.field.value(torch.tensor(places, dtype=torch.float64) @ turn.T).tolist()
