@@ -254,6 +254,11 @@ def unit_range(stored: NDArray[Any]) -> NDArray[np.float32]:
     return stored.astype(np.float32).clip(0, 1)
 
 
+def to_bytes(stored: NDArray[Any]) -> NDArray[np.uint8]:
+    """What `unit_range` takes, in 8 bits: rounded, or unchanged if it has no more."""
+    return stored if stored.dtype == np.uint8 else np.rint(255 * unit_range(stored)).astype(np.uint8)
+
+
 def is_depth_file(path: str | Path) -> bool:
     """Whether a file is a depth map by its name, or, of NPY and NPZ, by the shape of its array.
 

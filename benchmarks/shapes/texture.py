@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from mplicits.datasets import Camera, TexturedMesh, read_textured, sample_textured, turntable
+from mplicits.datasets.files import to_bytes
 from mplicits.neural_fields import (
     Field,
     InputError,
@@ -24,7 +25,7 @@ from mplicits.neural_fields import (
 )
 from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh
-from mplicits.pipelines.render.picture import Image, as_bytes, contact_sheet, write_picture
+from mplicits.pipelines.render.picture import Image, contact_sheet, write_picture
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.texture.train import texture_run
@@ -287,11 +288,11 @@ def _sheet(wanted: Sequence[Drawing], series: Sequence[_Series]) -> Image:
     """One line per camera: the original, each of the series, and its differences from the original."""
     lines = []
     for view, original in enumerate(wanted):
-        tiles, differences = [("original", as_bytes(original.rgb))], []
+        tiles, differences = [("original", to_bytes(original.rgb))], []
         for one in series:
             label, rgb = one.surface.name.replace("▷", " > "), one.drawings[view].rgb  # OpenCV draws ASCII
-            tiles.append((f"texture on {label}", as_bytes(rgb)))
-            differences.append((f"{label}: difference x {MAGNIFIED}", as_bytes(MAGNIFIED * np.abs(rgb - original.rgb))))
+            tiles.append((f"texture on {label}", to_bytes(rgb)))
+            differences.append((f"{label}: difference x {MAGNIFIED}", to_bytes(MAGNIFIED * np.abs(rgb - original.rgb))))
         lines.append(tiles + differences)
     return contact_sheet(*lines)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
-from ..files import DEPTH_SUFFIXES, numeric, read_arrays, read_image, read_rgb, readable, reader
+from ..files import DEPTH_SUFFIXES, numeric, read_arrays, read_image, read_rgb, readable, reader, to_bytes
 
 Float64 = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -100,8 +100,7 @@ def read_color(path: str | Path) -> Bytes:
         raise InputError(
             f"{path}: unknown extension {path.suffix!r}; colour pictures are read from {', '.join(COLOR_SUFFIXES)}"
         )
-    rgb, _ = read_rgb(path)
-    return rgb if rgb.dtype == np.uint8 else (rgb / np.float32(257) + 0.5).astype(np.uint8)
+    return to_bytes(read_rgb(path)[0])
 
 
 def fit_color(color: Bytes, size: tuple[int, int], *, source: str, resize: bool = False) -> Bytes:
@@ -120,7 +119,7 @@ def fit_color(color: Bytes, size: tuple[int, int], *, source: str, resize: bool 
     linear = srgb_to_linear((color / np.float32(255)).astype(np.float32))
     method = cv2.INTER_AREA if width > size[0] else cv2.INTER_LINEAR
     resized = np.asarray(cv2.resize(linear, size, interpolation=method), np.float32).clip(0, 1)
-    return (linear_to_srgb(resized) * 255 + 0.5).astype(np.uint8)
+    return to_bytes(linear_to_srgb(resized))
 
 
 def _read_array(path: Path) -> NDArray[np.generic]:

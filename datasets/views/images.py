@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import reduce
 from pathlib import Path
+from typing import Any, Generic, TypeVar, cast
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from ...neural_fields import InputError, Similarity
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ..cameras import Camera, intrinsics
-from ..files import read_rgb, readable, unit_range
+from ..files import read_rgb, readable, to_bytes, unit_range
 from .formats.colmap import find_model, find_models, read_colmap, read_colmap_points
 from .formats.neus import read_neus, read_neus_sphere
 from .formats.shots import DepthMap, DepthSource, Shot, find_depth_maps, list_images, read_depth_map
@@ -31,6 +32,24 @@ EXACT = 0.01  # pixels that distorting an undistorted point may miss it by
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+N = TypeVar("N", NDArray[np.float32], NDArray[np.float32] | None)
+
+
+class UnitRange(Generic[N]):
+    """An array that reads as float32 in [0, 1]; floating-point numbers that 8 bits hold as well are kept in these."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, instance: Any, owner: type) -> N:
+        kept = instance.__dict__[self.name]  # of the class an AttributeError: a field without a default
+        return kept if kept is None else cast(N, unit_range(kept))
+
+    def __set__(self, instance: Any, numbers: N | NDArray[np.integer]) -> None:
+        if numbers is not None and numbers.dtype.kind == "f":
+            small = to_bytes(numbers)
+            numbers = small if np.array_equal(unit_range(small), numbers) else numbers
+        instance.__dict__[self.name] = numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +66,15 @@ class PosedImage:
 
     name: str
     camera: Camera
-    color: NDArray[np.float32]
-    mask: NDArray[np.float32] | None
+    color: UnitRange[Float32] = UnitRange()
+    mask: UnitRange[Float32 | None] = UnitRange()
     depth: DepthMap | None = None
+
+    @property
+    def in_bytes(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+        """Colours and mask in 8 bits, which are not copied where they are kept so."""
+        color, mask = vars(self)["color"], vars(self)["mask"]
+        return to_bytes(color), None if mask is None else to_bytes(mask)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +158,7 @@ def _posed(
             observations[:, 0] = (np.cumsum(whole) - 1)[observations[:, 0]]
     views = tuple(_view(shot, width, depths) for shot in shots)
     if all(view.mask is None or view.mask.min() > OPAQUE for view in views):
-        views = tuple(replace(view, mask=None) for view in views)  # white in all views: no mask
+        views = tuple(view if view.mask is None else replace(view, mask=None) for view in views)  # white in all views
     if region is not None:
         similarity, words = region, "given"
     elif sphere is not None:
@@ -185,7 +210,7 @@ def _check_files(shots: Sequence[Shot]) -> None:
 
 
 def _view(shot: Shot, width: int | None, depths: DepthSource) -> PosedImage:
-    color, mask = read_picture(shot.image)
+    color, mask = read_rgb(shot.image)
     see_through = mask is not None  # then what is not object has no colour of its own
     camera = _fitted(shot, color.shape[1], color.shape[0])
     if shot.mask is not None:
@@ -197,17 +222,19 @@ def _view(shot: Shot, width: int | None, depths: DepthSource) -> PosedImage:
         pinhole = undistorted_camera(camera)
     except ValueError as error:
         raise InputError(f"{shot.named}: {error}; check the coefficients, or undistort the images") from error
-    steps: list[Callable[[Float32], Float32]] = []
-    if pinhole is not camera:
-        steps.append(partial(undistort, camera=camera, pinhole=pinhole))
+    whole = pinhole
     if width is not None and width < camera.width:
         pinhole = pinhole.resized(width, max(1, round(camera.height * width / camera.width)))
-        steps.append(partial(shrink, width=pinhole.width, height=pinhole.height))
-    for step in steps:
-        if see_through:
-            color, mask = resample(color, mask, step)
-        else:
-            color, mask = resample(color, None, step)[0], mask if mask is None else step(mask)
+
+    def change(image: Float32) -> Float32:
+        image = image if whole is camera else undistort(image, camera, whole)
+        return image if pinhole is whole else shrink(image, pinhole.width, pinhole.height)
+
+    if pinhole is not camera:
+        share = None if mask is None else unit_range(mask)
+        color, opacity = resample(color, share if see_through else None, change)
+        share = opacity if share is None or see_through else change(share)
+        color, mask = to_bytes(color), None if share is None else to_bytes(share)
     depth = None if shot.depth is None else read_depth_map(shot.depth, shot, depths)
     return PosedImage(shot.name, pinhole, color, mask, depth)
 
@@ -227,10 +254,10 @@ def _find_region(
 ) -> tuple[Similarity, str]:
     """The region from masks, sparse points or cameras, the first that succeeds, and its source in words."""
     cameras = [view.camera for view in views]
-    masks = [view.mask for view in views if view.mask is not None]
+    solid = [view.mask > OBJECT for view in views if view.mask is not None]
     tries: list[tuple[str, Callable[[], Similarity]]] = []
-    if len(masks) == len(views):
-        tries.append(("visual hull of the masks", lambda: region_from_masks(cameras, masks)))
+    if len(solid) == len(views):
+        tries.append(("visual hull of the masks", lambda: region_from_masks(cameras, solid)))
     if points is not None:
         tries.append(("sparse points", lambda: region_from_points(points, cameras)))
     tries.append(("what the cameras look at", lambda: region_from_cameras(cameras)))
@@ -295,30 +322,30 @@ def read_shots(source: Path) -> list[Shot]:
         return read_neus(source) if source.suffix.lower() == ".npz" else read_transforms(source)
 
 
-def read_picture(path: Path) -> tuple[Float32, Float32 | None]:
-    """A picture of 8 or 16 bits → ``(H, W, 3)`` display RGB, not multiplied by its opacity ``(H, W)``, if any."""
-    color, opacity = read_rgb(path)
-    return unit_range(color), None if opacity is None else unit_range(opacity)
-
-
-def read_mask(path: Path) -> Float32:
-    """A mask of any bit depth, grey or RGB → ``(H, W)``: 1 where it is more than half of white, else 0.
+def read_mask(path: Path) -> NDArray[np.uint8]:
+    """A mask of any bit depth, grey or RGB → ``(H, W)``: 255 where it is more than half of white, else 0.
 
     In a file whose largest number is 1, white is 1.
     """
-    image, _ = read_rgb(path)
+    image = reduce(np.maximum, np.moveaxis(read_rgb(path)[0], 2, 0))
     white = 1 if image.max() <= 1 else np.iinfo(image.dtype).max
-    return (image.max(axis=2) > white / 2).astype(np.float32)
+    return 255 * (image > white / 2).astype(np.uint8)
 
 
-def resample(color: Float32, alpha: Float32 | None, change: Callable[[Float32], Float32]) -> tuple[Float32, Float32]:
-    """Average pixels in linear light, weighted by opacity → display RGB and opacity of the new picture.
+def resample(
+    color: NDArray[Any], alpha: Float32 | None, change: Callable[[Float32], Float32]
+) -> tuple[Float32, Float32 | None]:
+    """Average pixels in linear light, weighted by opacity if there is any → display RGB and opacity of the new picture.
 
-    ``change`` makes of an image ``(H, W, 4)`` another, each of whose pixels is a weighted average.
+    ``color`` is float32 or of a file. ``change`` makes of an image ``(H, W, C)`` another, each of whose pixels is a
+    weighted average.
     """
-    weight = np.ones(color.shape[:2], np.float32) if alpha is None else alpha
-    light = np.dstack((srgb_to_linear(color) * weight[..., None], weight))
-    changed = change(light)
+    by_level = color.dtype == np.uint8  # then the light of 256 levels is that of all pixels
+    light = srgb_to_linear(unit_range(np.arange(256, dtype=np.uint8) if by_level else color))
+    light = light[color] if by_level else light
+    if alpha is None:
+        return linear_to_srgb(change(light).clip(0, 1)).astype(np.float32), None
+    changed = change(np.dstack((light * alpha[..., None], alpha)))
     opacity = changed[..., 3]
     mean = changed[..., :3] / np.where(opacity > 0, opacity, 1)[..., None]
     return linear_to_srgb(mean.clip(0, 1)).astype(np.float32), opacity.clip(0, 1)

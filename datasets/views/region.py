@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -90,7 +91,7 @@ def region_from_points(points: Float64, cameras: Sequence[Camera]) -> Similarity
     return _sphere(center, REGION.margin * radius)
 
 
-def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.floating]]) -> Similarity:
+def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[Any]]) -> Similarity:
     """The sphere around the visual hull: the points that are object in all views that have them in the picture.
 
     One view in twenty may differ, because one mask may lack a part; of four views or more one, if the hull is empty
@@ -100,7 +101,7 @@ def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.floa
 
     Args:
         cameras: V of them.
-        masks: V times ``(H, W)``, in [0, 1]; object is more than a half.
+        masks: V times ``(H, W)``, in [0, 1] or bool; object is more than a half.
 
     Raises:
         ValueError: the masks show no background, the hull is empty, or as for `region_from_cameras`.

@@ -59,9 +59,9 @@ def write_neus(folder: str | Path, images: PosedImages) -> None:
         for index, (name, view) in enumerate(_numbered(images)):
             matrices[f"world_mat_{index}"] = _projection(view.camera)
             matrices[f"scale_mat_{index}"] = scale
-            mask = np.ones(view.color.shape[:2], np.float32) if view.mask is None else view.mask
-            _write_png(partial / "image" / name, _bytes(view.color))
-            _write_png(partial / "mask" / name, _bytes(mask))
+            color, mask = view.in_bytes
+            _write_png(partial / "image" / name, color)
+            _write_png(partial / "mask" / name, np.full_like(color[..., 0], 255) if mask is None else mask)
         np.savez(partial / "cameras_sphere.npz", **matrices)
 
 
@@ -217,12 +217,9 @@ def _numbered(images: PosedImages) -> Iterator[tuple[str, PosedImage]]:
     return ((f"{index:0{digits}d}.png", view) for index, view in enumerate(images.views))
 
 
-def _bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    return np.rint(255 * values.clip(0, 1)).astype(np.uint8)
-
-
 def _with_alpha(view: PosedImage) -> NDArray[np.uint8]:
-    return _bytes(view.color if view.mask is None else np.concatenate((view.color, view.mask[..., None]), axis=-1))
+    color, mask = view.in_bytes
+    return color if mask is None else np.dstack((color, mask))
 
 
 def _write_png(path: Path, pixels: NDArray[np.uint8]) -> None:

@@ -55,13 +55,10 @@ def camera_mesh(images: PosedImages) -> Mesh:
     size, reach = frustum_size(cameras)
     order = torch.linspace(0, 1, len(cameras), dtype=torch.float64)
     colors = apply_color_map(order, (0, 1), COLOR_MAPS["viridis"]).numpy()
-    parts = [_wire_sphere(), _axes()]
+    parts, tube = [_wire_sphere(), _axes()], STYLE.tube * size
     for view, camera, color in zip(images.views, cameras, colors, strict=True):
         corners = _plane(camera, size, reach)
-        parts += [
-            _frame(camera.eye.numpy(), corners, color, STYLE.tube * size),
-            _picture(corners, view.color, STYLE.tube * size),
-        ]
+        parts += [_frame(camera.eye.numpy(), corners, color, tube), _picture(corners, view.color, tube)]
     if images.points is not None:
         step = 1 + (len(images.points) - 1) // STYLE.sparse_points
         parts.append(_octahedra(images.similarity.to_unit(images.points[::step]), STYLE.wire, STYLE.dark))

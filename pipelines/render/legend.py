@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .picture import Image, as_bytes
+from ...datasets.files import to_bytes
+from .picture import Image
 from .slice import FINEST, STYLE, Color, Slice, distance_color, level_color, round_step
 
 NAMES = str.maketrans({"δ": "delta", "−": "-", "–": "-", "°": " deg", "·": " "})
@@ -98,7 +99,7 @@ def with_color_bar(
         half = text_width(label, text) // 2
         left = min(max(x - half, margin // 2), max(margin // 2, width - 2 * half - margin // 2))
         _write(strip, label, (left, round(4.3 * text)), text, ink)
-    return np.concatenate((picture, as_bytes(strip[..., : picture.shape[2]])))
+    return np.concatenate((picture, to_bytes(strip[..., : picture.shape[2]])))
 
 
 def _ticks(limits: tuple[float, float], count: int) -> list[tuple[float, str]]:
@@ -146,7 +147,7 @@ def with_legend(
         entry.draw(strip[top : top + row, left : left + entry.width])
         start = left + (entry.width + text // 2 if entry.width else 0)
         _write(strip, entry.words, (start, top + row // 2), text, INK)
-    return np.concatenate((picture, as_bytes(strip)))
+    return np.concatenate((picture, to_bytes(strip)))
 
 
 def _entries(

@@ -17,11 +17,6 @@ Image = NDArray[np.uint8]
 Titled = tuple[str, Image]
 
 
-def as_bytes(colors: NDArray[np.floating]) -> Image:
-    """Numbers in [0, 1] → 0 to 255, rounded to the nearest; what is outside is clamped."""
-    return (colors.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-
-
 def contact_sheet(*rows: Sequence[Titled], gap: int = 12, strip: int = 40) -> Image:
     """Rows of titled pictures, each row of one height; shorter rows are filled up with white.
 

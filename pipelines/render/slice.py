@@ -14,8 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...datasets.files import to_bytes
 from ...neural_fields import Field
-from .picture import Image, as_bytes
+from .picture import Image
 
 Array = NDArray[np.floating]
 Floats = NDArray[np.float32]
@@ -159,7 +160,7 @@ def draw_slice(taken: Slice, *, iso_step: float, bands: bool = True) -> Image:
         color = FINEST if last and taken.finest else level_color(index)
         width = STYLE.zero_line * stroke * (1.0 if last else 0.75)
         _lay(image, color, _stroke(np.abs(level) / _slope(level, taken.pixel), width))
-    return as_bytes(image)
+    return to_bytes(image)
 
 
 def distance_color(values: Floats, *, reach: float, slope: Floats | float) -> Floats:

@@ -562,7 +562,7 @@ def digest_of(arrays: Iterable[NDArray[Any]]) -> str:
     """SHA-256 of what is in the arrays, one after the other: tells whether a resumed run sees the same data."""
     digest = hashlib.sha256()
     for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 

@@ -38,6 +38,15 @@ def test_images_keep_their_bits_and_channels(kind, extension, channels):
     assert np.abs(files.unit_range(rgb) - rgb / np.iinfo(kind).max).max() < 1e-7
 
 
+def test_bytes_are_rounded_to_the_nearest_and_clamped():
+    numbers = np.array([-0.5, 0.0, 0.4999 / 255, 0.5001 / 255, 1.0, 2.0])
+    assert files.to_bytes(numbers).tolist() == [0, 0, 0, 1, 255, 255]
+    assert files.to_bytes(np.array([0, 128, 129, 65535], np.uint16)).tolist() == [0, 0, 1, 255]
+    every = np.arange(256, dtype=np.uint8)
+    assert files.to_bytes(every) is every
+    assert np.array_equal(files.to_bytes(files.unit_range(every)), every)
+
+
 def test_what_opencv_does_not_know_pillow_may(tmp_path):
     iio.imwrite(tmp_path / "a.tga", RGBA[..., :3])
     assert np.array_equal(read_rgb(tmp_path / "a.tga")[0], RGBA[..., :3])

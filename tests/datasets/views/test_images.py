@@ -4,6 +4,7 @@ import json
 import math
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ import pytest
 import torch
 from mplicits.datasets import (
     Camera,
+    PosedImage,
     PosedImages,
     linear_to_srgb,
     look_at,
@@ -26,6 +28,7 @@ from refusals import refused
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 6
 CENTER, RADIUS = np.array([0.3, -0.2, 0.1]), 0.7
+ROUNDED = 0.5 / 255 + 1e-5  # of a picture that was resampled to 8 bits, in float32
 LENS = {"k1": -0.2, "k2": 0.05, "p1": 0.002, "p2": -0.001}
 
 
@@ -208,9 +211,9 @@ def test_smaller_pictures_are_averages_of_light_and_their_cameras_follow(tmp_pat
     read = read_posed_images(write_neus(tmp_path), width=WIDTH // 2)
     for index, (view, camera) in enumerate(zip(read.views, cameras(), strict=True)):
         light = srgb_to_linear(picture(index) / 255).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
-        np.testing.assert_allclose(view.color, linear_to_srgb(light), atol=1e-5)
+        np.testing.assert_allclose(view.color, linear_to_srgb(light), atol=ROUNDED)
         share = silhouette(camera).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean(axis=(1, 3))
-        np.testing.assert_allclose(view.mask, share, atol=1e-6)
+        np.testing.assert_allclose(view.mask, share, atol=ROUNDED)
         expected = camera.resized(WIDTH // 2, HEIGHT // 2)
         torch.testing.assert_close(view.camera.intrinsics, expected.intrinsics)
         assert (view.camera.width, view.camera.height) == (WIDTH // 2, HEIGHT // 2)
@@ -226,8 +229,9 @@ def test_transparent_pixels_lend_no_colour_to_their_neighbours(tmp_path):
     view = read_posed_images(tmp_path, region=Similarity.identity()).views[0]
     np.testing.assert_array_equal(view.mask, np.tile([1.0, 0.0], (HEIGHT, WIDTH // 2)))
     view = read_posed_images(tmp_path, width=WIDTH // 2, region=Similarity.identity()).views[0]
-    np.testing.assert_allclose(view.mask, 0.5, atol=1e-6)
-    np.testing.assert_allclose(view.color, np.broadcast_to(np.array([200, 100, 50]) / 255, view.color.shape), atol=1e-5)
+    np.testing.assert_allclose(view.mask, 0.5, atol=ROUNDED)
+    expected = np.broadcast_to(np.array([200, 100, 50]) / 255, view.color.shape)
+    np.testing.assert_allclose(view.color, expected, atol=ROUNDED)
 
 
 @pytest.mark.parametrize(
@@ -422,3 +426,20 @@ def test_photographs_of_other_kinds(tmp_path, extension):
             frame["file_path"] = f"images/{index}"  # Blender's leave the extension out
             cv2.imwrite(str(tmp_path / "images" / f"{index}{extension}"), picture(index)[..., ::-1], lossless)
     assert np.allclose(read_posed_images(tmp_path).views[2].color, picture(2) / 255, atol=1e-6)
+
+
+def test_pictures_stay_in_the_bits_they_have_and_read_as_float32() -> None:
+    camera = look_at((0, 0, 4), (0, 0, 0), width=16, height=16)
+    levels = np.arange(768, dtype=np.uint8).reshape(16, 16, 3)
+    between = (np.arange(256, dtype=np.float32).reshape(16, 16) / 256 + np.float32(0.001)).clip(0, 1)
+    view = PosedImage("0.png", camera, levels, between)
+    assert view.color.dtype == np.float32
+    assert np.array_equal(view.color, levels / np.float32(255))
+    assert view.in_bytes[0] is levels
+    assert np.array_equal(view.mask, between)  # numbers that 8 bits do not hold
+    assert np.array_equal(view.in_bytes[1], np.rint(255 * between).astype(np.uint8))
+    copy = replace(view, name="1.png", mask=None)
+    assert vars(copy)["color"].dtype == np.uint8
+    assert np.array_equal(copy.color, view.color)
+    assert copy.mask is None
+    assert copy.in_bytes[1] is None
