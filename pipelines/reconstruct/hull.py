@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -51,20 +51,17 @@ def grid_in_ball(resolution: int) -> tuple[Tensor, Tensor]:
     return points[places], places
 
 
-def silhouettes(
-    views: Sequence[PosedImage], similarity: Similarity, points: Tensor, edge: float
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """For each view, which points ``(N, 3)`` it sees, and which have object within half an ``edge``, ``(N,)`` each."""
-    for view in views:
-        camera, mask = view.camera.moved(similarity), _object_in(view)
-        cut = bool(_border(mask).any())
-        mask = _widened(mask, camera, 0.5 * edge, edge)
-        pixels, depth, inside = camera.in_view(points.numpy())
-        column, row = np.rint(pixels[inside]).astype(np.int64).T
-        objects = inside.copy()
-        objects[inside] = mask[row, column]
-        # What a picture does not show is no object, unless its rim cuts the object.
-        yield torch.from_numpy(inside if cut else depth > 0), torch.from_numpy(objects)
+def silhouette(view: PosedImage, similarity: Similarity, points: Tensor, edge: float) -> tuple[Tensor, Tensor]:
+    """Which points ``(N, 3)`` a view sees, and which have object within half an ``edge``, ``(N,)`` each."""
+    camera, mask = view.camera.moved(similarity), _object_in(view)
+    cut = bool(_border(mask).any())
+    mask = _widened(mask, camera, 0.5 * edge, edge)
+    pixels, depth, inside = camera.in_view(points.numpy())
+    column, row = np.rint(pixels[inside]).astype(np.int64).T
+    objects = inside.copy()
+    objects[inside] = mask[row, column]
+    # What a picture does not show is no object, unless its rim cuts the object.
+    return torch.from_numpy(inside if cut else depth > 0), torch.from_numpy(objects)
 
 
 def _widened(mask: NDArray[np.bool_], camera: Camera, length: float, nearest: float) -> NDArray[np.bool_]:
@@ -91,7 +88,8 @@ class Agreement:
     def of(cls, views: Sequence[PosedImage], similarity: Similarity, limits: Limits | None = None) -> Agreement:
         """Compare views at the points of the grid."""
         limits = limits or Limits()
-        masks = list(silhouettes(views, similarity, grid_in_ball(limits.cells)[0], 2 / limits.cells))
+        points = grid_in_ball(limits.cells)[0]
+        masks = [silhouette(view, similarity, points, 2 / limits.cells) for view in views]
         visible, objects = (torch.stack(parts) for parts in zip(*masks, strict=True))
         return cls(views, similarity, visible, visible & ~objects, limits)
 
@@ -376,11 +374,15 @@ def _object_vertices(
 
 def _agreed(views: Sequence[PosedImage], similarity: Similarity, points: Tensor, edge: float) -> Tensor:
     """Which points ``(N, 3)`` are object for enough of the views that see them, if enough do ``(N,)``."""
-    visible, object_in = torch.zeros(len(points)), torch.zeros(len(points))
-    for sees, objects in silhouettes([view for view in views if view.mask is not None], similarity, points, edge):
-        visible += sees
-        object_in += objects
-    return (object_in >= HULL.agree * visible) & (visible >= max(1.0, HULL.seeing * len(views)))
+    kept, (visible, object_in) = torch.arange(len(points)), torch.zeros(2, len(points))
+    for view in views:
+        sees, objects = silhouette(view, similarity, points[kept], edge)
+        visible, object_in = visible + sees, object_in + objects
+        # Others stay below the share, even if all further views see object.
+        may = object_in + (len(views) - visible) >= HULL.agree * len(views)
+        kept, visible, object_in = kept[may], visible[may], object_in[may]
+    kept = kept[(object_in >= HULL.agree * visible) & (visible >= max(1.0, HULL.seeing * len(views)))]
+    return torch.zeros(len(points), dtype=torch.bool).index_fill(0, kept, value=True)
 
 
 def _all_around(empty: NDArray[np.bool_], resolution: int) -> NDArray[np.bool_]:
@@ -404,9 +406,8 @@ def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int =
         for step in range(steps):
             points = ball_points(HULL.batch, radius=1.0, generator=torch.default_generator).to(place)
             jet = network.jet(points)
-            loss = HULL.data_weight * data_loss(jet.value, grid(points)) + HULL.eikonal_weight * eikonal_loss(
-                jet.gradient
-            )
+            loss = HULL.data_weight * data_loss(jet.value, grid(points))
+            loss = loss + HULL.eikonal_weight * eikonal_loss(jet.gradient)
             for group in adam.param_groups:
                 group["lr"] = HULL.rate * (1 - step / steps)
             adam.zero_grad(set_to_none=True)
