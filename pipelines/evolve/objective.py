@@ -61,7 +61,7 @@ class EvolveObjective(Objective):
             self.kept["pool"] = band_points(self.field, count, self.width, self.generator, level=self.level)
         pool = self.kept["pool"]
         half, part = config.batch // 2, config.batch // 16
-        rows = upload(self.sampler.at_step(step, self.kept).rows(half, self.generator), pool.device)
+        rows = self.sampler.at_step(step, self.kept).rows(half, self.generator)
         known = self.known.take(rows)
         bounds = self.bounds.take(self._draw(len(self.bounds), part if len(self.bounds) and not self.level else 0))
         anywhere = uniform_spacetime(0 if self.level else part, self.generator).to(pool.device)

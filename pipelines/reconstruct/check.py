@@ -28,6 +28,7 @@ from ..training.progress import Progress, Report, silent
 from .frustums import camera_mesh
 from .hull import Agreement, named
 from .measured import UNITS, said_outside
+from .model import meets_sphere
 
 Float64 = NDArray[np.float64]
 
@@ -379,10 +380,7 @@ def _mask_inside(views: Sequence[PosedImage], cameras: Sequence[Camera]) -> floa
         step = max(1, max(view.mask.shape) // 64)
         size = (max(1, camera.width // step), max(1, camera.height // step))
         weight = cv2.resize(view.mask, size, interpolation=cv2.INTER_AREA).reshape(size[::-1])
-        eye, directions = (x.numpy() for x in camera.resized(*size).rays(dtype=torch.float64))
-        depth = np.maximum(-(directions @ eye), 0)  # of the nearest point to the middle
-        meets = np.linalg.norm(eye + depth[..., None] * directions, axis=-1) <= 1
-        shares.append(float(weight[meets].sum() / weight.sum()))
+        shares.append(float(weight[meets_sphere(camera.resized(*size))].sum() / weight.sum()))
     return float(np.median(shares)) if shares else None
 
 
@@ -390,11 +388,8 @@ def _exposure(views: Sequence[PosedImage]) -> Iterator[str]:
     """A warning about images that are far brighter or darker than the others."""
     light = np.array([_brightness(view) for view in views])
     usual = np.median(light)
-    odd = [
-        view.name
-        for view, level in zip(views, light, strict=True)
-        if level > LIMITS.exposure * usual or LIMITS.exposure * level < usual
-    ]
+    far = (light > LIMITS.exposure * usual) | (LIMITS.exposure * light < usual)
+    odd = [view.name for view, is_odd in zip(views, far, strict=True) if is_odd]
     if odd:
         yield f"{len(odd)} of {len(views)} images are two stops or more off the others' brightness: {named(odd)}"
 

@@ -90,20 +90,14 @@ class MeasuredDepths:
         cameras = [view.camera.moved(images.similarity) for view in views]
         axes = [camera.world_from_camera[:3, :3].numpy() for camera in cameras]
         self.eyes = torch.stack([camera.eye for camera in cameras]).float().to(device)
-        counts = [len(part.numbers) for part in parts]
-
-        def joined(arrays: Sequence[NDArray[np.generic]], empty: NDArray[np.generic]) -> Tensor:
-            return torch.from_numpy(np.concatenate([empty, *arrays])).to(device)
-
-        along = [part.lines @ axes[part.view].T for part in parts]
-        self.along = joined([lines.astype(np.float32) for lines in along], np.empty((0, 3), np.float32))
-        numbers = [part.numbers.astype(np.float32) for part in parts]
-        self.numbers = joined(numbers, np.empty(0, np.float32))
-        forms, views_of, exact = (
-            np.repeat(np.array([getattr(part, name) for part in parts], kind), counts)
-            for name, kind in (("form", np.uint8), ("view", np.int16), ("exact", np.bool_))
+        counts = torch.tensor([len(part.numbers) for part in parts], dtype=torch.int64)
+        along = np.concatenate([np.empty((0, 3)), *(part.lines @ axes[part.view].T for part in parts)])
+        numbers = np.concatenate([np.empty(0), *(part.numbers for part in parts)])
+        self.along, self.numbers = (torch.from_numpy(part).float().to(device) for part in (along, numbers))
+        self.forms, self.views, self.exact = (
+            torch.tensor([getattr(part, name) for part in parts], dtype=kind).repeat_interleave(counts).to(device)
+            for name, kind in (("form", torch.uint8), ("view", torch.int16), ("exact", torch.bool))
         )
-        self.forms, self.views, self.exact = (torch.from_numpy(array).to(device) for array in (forms, views_of, exact))
         self.affine = torch.zeros(len(views), 2, device=device)
         self.is_loose, self.is_exact = bool((self.forms != AS_IT_IS).any()), bool(self.exact.any())
 
@@ -136,13 +130,9 @@ class MeasuredDepths:
         rows = loose.nonzero()[:, 0][(first[owned, None] + steps * count[owned, None]).long().reshape(-1)]
         view, along = self.views[rows].long(), self.along[rows]
         length = along.norm(dim=1)
+        directions = along / length[:, None]
         hits = sphere_trace(
-            distance,
-            self.eyes[view],
-            along / length[:, None],
-            tolerance=LIMITS.tolerance,
-            resolution=LIMITS.tolerance,
-            radius=1.0,
+            distance, self.eyes[view], directions, tolerance=LIMITS.tolerance, resolution=LIMITS.tolerance, radius=1.0
         )
         hit, depths = hits.mask, hits.depth / length
         wanted = torch.where(self.forms[rows] == RELATIVE, depths, _inverse(depths))

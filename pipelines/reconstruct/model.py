@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
-from ...neural_fields.backend.devices import graph_input, precise
+from ...neural_fields.backend.devices import precise
 from ...neural_fields.networks.colors import BackgroundField, ColorNetwork, Radiance
 from ...neural_fields.networks.grids import HashEncoding
 from ...neural_fields.networks.multiscale import fit_sphere
 from ...neural_fields.networks.neus_mlp import NeusSDF
 from ...neural_fields.volume.render import Rendered, Sampling, render_volume
-from ...neural_fields.volume.weights import sphere_span
 from ..training.settings import ReconstructConfig
 from ..training.trainer import ErrorWeightedSampler, seeded
 
@@ -195,17 +195,25 @@ class Rays(NamedTuple):
     row: Tensor  # (R,) number of the pixel in the pool
 
 
-def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Origins and unit directions, both ``(H · W, 3)`` float32, of a camera's pixels."""
-    eye, directions = camera.rays()
-    return eye.expand(directions.shape[:2].numel(), 3), directions.reshape(-1, 3)
+def meets_sphere(camera: Camera) -> NDArray[np.bool_]:
+    """Which pixels ``(H, W)`` of a pinhole in unit-sphere coordinates have rays that meet the unit sphere.
+
+    Those along l = (x, y, 1) from an eye e, both in the camera's axes, do if |e| < 1, or if ⟨e, l⟩ < 0 and
+    ⟨e, l⟩² > (|e|² − 1) |l|².
+    """
+    fx, fy, cx, cy = camera.fx_fy_cx_cy
+    x, y = (np.arange(camera.width) - cx) / fx, (np.arange(camera.height)[:, None] - cy) / fy
+    right, down, forward = (camera.world_from_camera[:3, :3].T @ camera.eye).tolist()
+    beyond = float(camera.eye.square().sum()) - 1
+    along = right * x + (down * y + forward)
+    return (beyond < 0) | ((along < 0) & (along * along > beyond * x * x + beyond * (y * y + 1)))
 
 
 class RayPool:
     """The pixels whose rays meet the unit sphere; ``whole``: all of them, where what lies outside is learnt too.
 
-    Of a view, by its number, pixels ``(H, W)`` are ``left_out``. Of all pixels only the colours are kept; directions
-    follow from the pixel's number when rays are drawn.
+    Of a view, by its number, pixels ``(H, W)`` are ``left_out``. Of each pixel only colour and mask are kept, in four
+    bytes. Their places follow from those of the runs of consecutive pixels, and directions from the places.
 
     Raises:
         InputError: no ray of any picture meets the region of interest.
@@ -227,52 +235,48 @@ class RayPool:
         lens = [camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras]
         self.lens = torch.stack(lens).float().to(device)  # (V, 4): fx, fy, cx, cy
         self.widths = torch.tensor([camera.width for camera in cameras], device=device)
-        colors, masks, pixels, owners, hits = [], [], [], [], 0
-        for index, (view, camera) in enumerate(zip(views, cameras, strict=True)):
-            near, far = sphere_span(*camera_rays(camera))
-            hit = far > near
-            hits += int(hit.sum())
-            chosen = torch.ones_like(hit) if whole else hit
-            if left_out and index in left_out:
-                chosen = chosen & ~torch.from_numpy(left_out[index].reshape(-1))
-            kept = chosen.nonzero()[:, 0]
-            pixels.append(kept.int())
-            owners.append(torch.full_like(kept, index, dtype=torch.int16))
-            # Eight bits hold what pictures hold; a pool of float32 would be four times as large.
-            colors.append(_bytes(view.color.reshape(-1, 3))[kept])
-            if self.has_masks and view.mask is not None:
-                masks.append(_bytes(view.mask.reshape(-1))[kept])
-        self.colors, self.pixels = torch.cat(colors).to(device), torch.cat(pixels).to(device)
-        self.owners = torch.cat(owners).to(device)
-        self.masks = torch.cat(masks).to(device) if masks else None
-        if not hits:
+        if not any(meets_sphere(camera).any() for camera in cameras):
             raise InputError("no pixel of any picture sees the region of interest; see `mplicits check-cameras`")
+        runs = []
+        for index, camera in enumerate(cameras):
+            chosen = np.ones((camera.height, camera.width), bool) if whole else meets_sphere(camera)
+            if left_out and index in left_out:
+                chosen &= ~left_out[index]
+            # The numbers of pixels from which on, and before which, pixels are chosen.
+            runs.append(np.flatnonzero(np.diff(chosen.reshape(-1), prepend=False, append=False)).reshape(-1, 2))
+        first, last = np.concatenate(runs).T
+        ends = (last - first).cumsum()
+        owners = np.repeat(np.arange(len(runs)), [len(run) for run in runs])
+        # By run: how many pixels there are up to its end, the pixel's number less that in the pool, and the picture's.
+        self.ends, self.offsets, self.owners = (
+            torch.from_numpy(part).to(device) for part in (ends, last - ends, owners)
+        )
+
+        def joined(pictures: Iterable[NDArray[np.uint8] | None], *shape: int) -> Tensor:
+            flat = (np.reshape(picture, (-1, *shape)) for picture in pictures if picture is not None)
+            parts = [rows[start:end] for rows, run in zip(flat, runs, strict=True) for start, end in run]
+            return torch.from_numpy(np.concatenate(parts)).to(device)
+
+        self.colors = joined((view.in_bytes[0] for view in views), 3)
+        self.masks = joined(view.in_bytes[1] for view in views) if self.has_masks else None
 
     def __len__(self) -> int:
-        return len(self.pixels)
+        return len(self.colors)
 
     def draw(self, count: int, generator: torch.Generator, sampler: ErrorWeightedSampler | None = None) -> Rays:
         """``count`` rays at random, with replacement; ``sampler`` chooses the pixels."""
-
-        def draw() -> Tensor:
-            if sampler is None:
-                return torch.randint(len(self), (count,), generator=generator)
-            return sampler.rows(count, generator)
-
-        rows = graph_input(draw, self.device)
-        view = self.owners[rows].long()
+        rows = (sampler or ErrorWeightedSampler(len(self), 0.0, self.device)).rows(count, generator)
+        view, place = self.places(rows)
         fx, fy, cx, cy = self.lens[view].unbind(dim=1)
-        x, y = self.places(rows).unbind(dim=1)
+        x, y = place.unbind(dim=1)
         local = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
         directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], local), dim=1)
         mask = torch.ones(len(rows), device=self.device) if self.masks is None else self.masks[rows] / 255
         return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows)
 
-    def places(self, rows: Tensor) -> Tensor:
-        """Columns and rows ``(R, 2)`` int64 of the pixels with these numbers ``(R,)`` in their pictures."""
-        pixel, width = self.pixels[rows].long(), self.widths[self.owners[rows].long()]
-        return torch.stack((pixel % width, pixel // width), dim=1)
-
-
-def _bytes(numbers: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.rint(np.clip(numbers, 0, 1) * 255).astype(np.uint8))
+    def places(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Pictures ``(R,)`` of the pixels with these numbers ``(R,)``, and columns and rows ``(R, 2)``; all int64."""
+        run = torch.searchsorted(self.ends, rows, right=True)
+        view, pixel = self.owners[run], rows + self.offsets[run]
+        width = self.widths[view]
+        return view, torch.stack((pixel % width, pixel // width), dim=1)

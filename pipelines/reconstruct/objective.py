@@ -40,6 +40,8 @@ class Schedule:
     poses_from: float = 0.1  # share of the training after which camera poses are refined
     pose_rate: float = 3.0  # their learning rate over the geometry's
     depth_rays: int = 256  # measured rays per step
+    strip: int = 16  # neighbouring pixels that share an error, at least
+    strips: int = 1 << 20  # of them, at most; of more pixels each strip has more
     align_every: int = 64  # steps between two fits of scale and shift of depth maps to the surface
     faded: float = 0.5  # share of the training after which depths that were estimated from single pictures do not count
 
@@ -86,18 +88,16 @@ class SceneObjective(Objective):
         if grid:
             groups.append(Group(grid, lambda done: config.grid_rate * config.color_rate * rate(done)))
         if model.poses is not None:  # not before there is something to be compared with
-            moved = list(model.poses.parameters())
-            groups.append(
-                Group(
-                    moved, lambda done: self.schedule.pose_rate * rate(done) if done > self.schedule.poses_from else 0.0
-                )
-            )
+            plan = self.schedule
+            late = [*model.poses.parameters()], lambda done: plan.pose_rate * rate(done) * (done > plan.poses_from)
+            groups.append(Group(*late))
         super().__init__(model, groups, torch.Generator().manual_seed(config.seed))
         self.model, self.pool, self.config, self.pictures = model, pool, config, pictures
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
         # Recent values, on the CPU, which reads them: samples evaluated per ray, and the surface's uncertainty.
         self.kept["lately"] = torch.tensor([0.0, 1 / float(model.inv_std.detach())])
-        self.sampler = ErrorWeightedSampler(len(pool), config.focus, pool.device)
+        strip = max(self.schedule.strip, math.ceil(len(pool) / self.schedule.strips))
+        self.sampler = ErrorWeightedSampler(len(pool), config.focus, pool.device, strip=strip)
         self.kept |= self.sampler.kept
         self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
         if self.grid is not None:
@@ -198,18 +198,12 @@ class SceneObjective(Objective):
         origins, directions = rays.origins, rays.directions
         if self.model.poses is not None:
             origins, directions = self.model.poses.moved(origins, directions, rays.view)
+        skipped = {"alpha_threshold": config.skip, "skip_share": config.skip_share, "sdf_grid": self.grid}
+        annealed = self.by_time(lambda done: done / config.anneal) if kind.annealing else 1.0
         rendered = self.model.render(
-            origins,
-            directions,
-            self.sampling,
-            cos_anneal=self.by_time(lambda done: done / config.anneal) if kind.annealing else 1.0,
-            level=kind.level,
-            early_stop_eps=config.least_weight,
-            alpha_threshold=config.skip,
-            skip_share=config.skip_share,
-            sdf_grid=self.grid,
-            generator=self.generator,
-        )
+            origins, directions, self.sampling, cos_anneal=annealed, level=kind.level,
+            early_stop_eps=config.least_weight, generator=self.generator, **skipped,
+        )  # fmt: skip
         samples = (rendered.counts > 0).sum() / len(origins)
         target = rays.color
         if pool.has_masks:
@@ -256,7 +250,7 @@ class SceneObjective(Objective):
         opaque = rendered.opacity.detach() > 0.5
         rows = first_rows(opaque, min(options.patches, len(opaque)))
         used, rows = rows < len(opaque), rows.clamp(max=len(opaque) - 1)
-        origins, directions, view = lines[0][rows], lines[1][rows], rays.view[rows]
+        origins, directions = lines[0][rows], lines[1][rows]
         # Half of the light is stopped before the median depth.
         middle = (rendered.weights.detach()[rows].cumsum(dim=1) >= 0.5).int().argmax(dim=1, keepdim=True)
         depth = rendered.depths[rows].gather(1, middle)[:, 0]
@@ -268,7 +262,7 @@ class SceneObjective(Objective):
             eyes, columns = poses.moved(pool.eyes[views], pool.axes.mT.reshape(-1, 3), views)
             cameras = Cameras(eyes[::3], columns.reshape(-1, 3, 3).mT, pool.lens)
         distance = self.grid or (lambda x: self.model.geometry.value(x, level=0))
-        pixels = Pixels(view, pool.places(rays.row[rows]))
+        pixels = Pixels(*pool.places(rays.row[rows]))
         return consistency_loss(surface, pixels, cameras, pictures, distance, options).mean()
 
 

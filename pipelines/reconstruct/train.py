@@ -126,11 +126,9 @@ def reconstruct(
     with reported(progress, "reading the pictures"):
         maps = None if config.depth_maps is None else Path(config.depth_maps)
         depths = DepthSource(maps, config.depth_kind, config.depth_scale)
-        images = (
-            data
-            if isinstance(data, PosedImages)
-            else read_posed_images(data, width=config.width, depths=depths, allow_missing=config.allow_missing)
-        )
+        images = data
+        if not isinstance(images, PosedImages):
+            images = read_posed_images(images, width=config.width, depths=depths, allow_missing=config.allow_missing)
     load_compiler()
     training = _Reconstruction(images, config, folder, progress or silent, budget, resume=resume)
     with folder.writing(HELD_OUT_FILE, PREVIEW_FILE, MESH_FILE):
@@ -140,7 +138,7 @@ def reconstruct(
 
 
 def _pixels(view: PosedImage) -> int:
-    return view.color.shape[0] * view.color.shape[1]
+    return view.camera.height * view.camera.width
 
 
 class _Reconstruction(Training[ReconstructConfig, Field]):
@@ -232,7 +230,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
 
     def _masked_cameras(self) -> list[MaskedCamera]:
         """The cameras that were trained on, in unit-sphere coordinates, and their masks."""
-        return [(view.camera.moved(self.similarity), view.mask) for view in self.train_views]
+        return [(view.camera.moved(self.similarity), view.in_bytes[1]) for view in self.train_views]
 
     @property
     def level(self) -> int:
@@ -269,9 +267,6 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         if pairs:
             self.folder.keep(HELD_OUT_FILE, picture_bytes(self._sheet(pairs[: FINISH.sheet_views])))
         record = self.folder.finish(self.model.geometry, self.images.similarity, record, gone=(PREVIEW_FILE,))
-        return self._result(out, texture, record)
-
-    def _result(self, out: Path | None, texture: TextureField | None, record: dict[str, Any]) -> Reconstruction:
         model, images = self.model.cpu(), self.images
         return Reconstruction(model.geometry, images.similarity, out, record, model, texture, images)
 
@@ -307,18 +302,14 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
             room = max(int(limit / 2 / len(views) / self._pixel_seconds()), FINISH.timed_pixels)
             if room < max(map(_pixels, views)):
                 views = [reduced(view, room) for view in views]
-                height, width = views[0].color.shape[:2]
-                self.budget.notes.append(f"held-out views are measured at {width} × {height} pixels")
+                camera = views[0].camera
+                self.budget.notes.append(f"held-out views are measured at {camera.width} × {camera.height} pixels")
         for index, view in enumerate(views):
             self.report(Progress("held-out views", index, len(views), index / len(views), {}))
             pairs.append((view, self._image(view)))
         if views:
             self.report(Progress("held-out views", len(views), len(views), 1.0, {}))
         return pairs
-
-    def _torn(self) -> dict[str, int]:
-        """How many pixels are left out of each picture whose mask has a hole."""
-        return {self.train_views[index].name: int(hole.sum()) for index, hole in self.holes.items()}
 
     def _figures(self, pairs: Sequence[tuple[PosedImage, ViewImage]]) -> dict[str, Any] | None:
         """Means over the held-out views, and each one's figures; None without such views."""
@@ -369,6 +360,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         """What ``run.json`` holds."""
         model, trainer = self.model, self.trainer
         parts = {"geometry": model.geometry, "color": model.color}
+        left_out = {self.train_views[index].name: int(hole.sum()) for index, hole in self.holes.items()}
         return {
             "data": str(self.images.source),
             "reading": self.images.reading,
@@ -380,7 +372,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
             "deltas": model.geometry.deltas.tolist(),
             **({} if model.exposures is None else {"exposures": self._by_view(("gain", "offset"), model.exposures())}),
             **({"left_out": [view.name for view in self.odd]} if self.odd else {}),
-            **({"mask_holes": self._torn()} if self.holes else {}),
+            **({"mask_holes": left_out} if left_out else {}),
             **({} if self.measured is None else {"measured_depths": len(self.measured)}),
             **({} if model.poses is None else {"poses": self._by_view(("turn", "shift"), model.poses())}),
             "inv_std": float(model.inv_std.detach()),

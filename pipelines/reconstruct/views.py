@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.cameras import Camera
+from ...datasets.files import unit_range
 from ...datasets.views.images import OBJECT, PosedImage, resample, shrink
 from ...neural_fields import Field, Mesh, Similarity, sphere_trace
 from ...neural_fields.volume.render import Sampling
-from ...neural_fields.volume.weights import sphere_span
 from ..render.picture import Image, stacked
 from ..render.rasterise import mesh_view
 from ..render.studio import sees
-from .model import SceneModel, camera_rays
+from .model import SceneModel, meets_sphere
 
 Float32 = NDArray[np.float32]
 
@@ -60,12 +60,13 @@ def render_camera(
     with (rays done, rays in all).
     """
     device = model.background.device
-    origins, directions = (part.to(device) for part in camera_rays(camera))
+    eye, directions = camera.rays(device=device)
+    directions = directions.reshape(-1, 3)
+    origins = eye.expand_as(directions)
     color = model.background.expand(len(origins), 3).clone()
     normal, opacity = torch.zeros_like(color), torch.zeros_like(color[:, 0])
-    near, far = sphere_span(origins, directions)
     # Rays that pass the region of interest see the background, whose colour is known unless it is learnt.
-    cast = (far > near).nonzero()[:, 0] if model.outside is None else torch.arange(len(origins), device=device)
+    cast = torch.from_numpy(np.flatnonzero(meets_sphere(camera) | (model.outside is not None))).to(device)
     done = 0
     for rows in cast.split(4096):
         rendered = model.render(
@@ -158,17 +159,13 @@ def comparison_sheet(pairs: Sequence[tuple[PosedImage, ViewImage]], background: 
         normals = image.opacity[..., None] * normals + (1 - image.opacity[..., None])
         panels = [target_of(view, background), image.color, np.clip(normals, 0, 1)]
         rows.append((np.concatenate(panels, axis=1) * 255).round().astype(np.uint8))
-    return _enlarged(stacked(rows, gap=4))
-
-
-def _enlarged(picture: Image, least: int = 600) -> Image:
-    """Small pictures in whole multiples of their size, so that their pixels can be seen."""
-    factor = max(1, least // picture.shape[1])
+    picture = stacked(rows, gap=4)
+    factor = max(1, 600 // picture.shape[1])  # so that pixels of small pictures can be seen
     return picture.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
-MaskedCamera = tuple[Camera, NDArray[np.float32] | None]
-"""A camera in unit-sphere coordinates, and the mask ``(H, W)`` of the object in its picture."""
+MaskedCamera = tuple[Camera, NDArray[np.float32] | NDArray[np.uint8] | None]
+"""A camera in unit-sphere coordinates, and the mask ``(H, W)`` of the object in its picture, which may be in bytes."""
 
 
 @torch.no_grad()
@@ -188,7 +185,7 @@ def visible_points(field: Field, views: Sequence[MaskedCamera]) -> tuple[Tensor,
         eye, directions = camera.rays(device=field.like.device)
         traced = torch.ones(directions.shape[:2], dtype=torch.bool)
         if mask is not None:
-            traced = torch.from_numpy(shrink(mask, camera.width, camera.height) > OBJECT)
+            traced = torch.from_numpy(shrink(unit_range(mask), camera.width, camera.height) > OBJECT)
         rays = directions[traced.to(directions.device)].to(field.like)
         eyes = eye.to(rays).expand_as(rays)
         hits = sphere_trace(field, eyes, rays, tolerance=1e-3, resolution=1e-3, radius=1.0)
@@ -239,7 +236,8 @@ def count_views(
         seen = sees(large, mesh_view(surface, large), points)
         if mask is not None:
             column, row = np.rint(camera.in_view(points[seen])[0]).astype(np.int64).T
-            seen[seen] = mask[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)] > OBJECT
+            place = row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)
+            seen[seen] = unit_range(mask[place]) > OBJECT
         counts += seen
         if progress is not None:
             progress(index + 1, len(views))

@@ -17,7 +17,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
-from ...neural_fields.backend.devices import precise
+from ...neural_fields.backend.devices import graph_input, precise
 from .progress import Progress, Report, silent
 
 Rate = Callable[[float], float]
@@ -361,12 +361,13 @@ class ErrorWeightedSampler:
     Of N pixels, one of the n in a strip with the error e has the probability ``(1 - share) / N + share · e / (n Σ e)``.
     Uniform samples alone learn late what few photographs show. A ``share`` below 1 leaves every pixel some probability.
     Errors are running means that begin with 1. A ``strip`` is a number of neighbouring pixels on a line; it is 1 for
-    samples that are no neighbours.
+    samples that are no neighbours. All but the random numbers is on the device.
     """
 
     def __init__(self, pixels: int, share: float, device: torch.device, *, strip: int = 16) -> None:
-        self.pixels, self.share, self.strip = pixels, share, strip
-        self.errors = torch.ones(-(-pixels // strip), device=device)
+        self.pixels, self.share, self.strip, self.device = pixels, share, strip, device
+        self.errors = torch.ones(-(-pixels // strip) if share else 0, device=device)
+        self.bounds = torch.zeros_like(self.errors, dtype=precise(device))
         self.refresh()
 
     @property
@@ -376,21 +377,23 @@ class ErrorWeightedSampler:
 
     def at_step(self, step: int, kept: MutableMapping[str, Tensor]) -> ErrorWeightedSampler:
         """The sampler with the state in an objective's ``kept``, refreshed every 16 steps."""
+        if len(kept["errors"]) != len(self.errors):  # an older version had other strips
+            kept.update(self.kept)
         self.errors, self.bounds = kept["errors"], kept["bounds"]
         if step % 16 == 0:
             self.refresh()
-            kept["bounds"] = self.bounds
         return self
 
     def refresh(self) -> None:
-        """Update the probabilities to the current errors; the host waits for a GPU."""
-        self.bounds = self.errors.double().cumsum(0).cpu()
+        """Update the probabilities to the current errors, in the memory that recorded steps read."""
+        torch.cumsum(self.errors, 0, dtype=self.bounds.dtype, out=self.bounds)
 
     def rows(self, count: int, generator: torch.Generator) -> Tensor:
-        """``(count,)`` numbers of pixels on the CPU, with replacement."""
+        """``(count,)`` numbers of pixels, with replacement."""
         if not self.share:
-            return torch.randint(self.pixels, (count,), generator=generator)
-        place, within = torch.rand(2, count, generator=generator, dtype=torch.float64)
+            return graph_input(lambda: torch.randint(self.pixels, (count,), generator=generator), self.device)
+        kind = precise(self.device)
+        place, within = graph_input(lambda: torch.rand(2, count, generator=generator, dtype=kind), self.device)
         # The first (1 - share) of the unit interval stands for even draws, and the rest for those by errors.
         by_error = ((place - (1 - self.share)) / self.share).clamp_min(0) * self.bounds[-1]
         strips = torch.searchsorted(self.bounds, by_error, right=True).clamp_max(len(self.bounds) - 1)

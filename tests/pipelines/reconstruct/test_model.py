@@ -6,13 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import PosedImage, look_at
+from mplicits.datasets import Camera, PosedImage, look_at
+from mplicits.datasets.cameras import intrinsics
+from mplicits.datasets.clouds.point_cloud import unit_rows
 from mplicits.neural_fields import ColorNetwork, InputError, Similarity, Sphere
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.neural_fields.volume.weights import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
-from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene, camera_rays
+from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene, meets_sphere
 from reconstructions import TINY_SCENE
+from torch import Tensor
 
 SMALL = replace(TINY_SCENE, widths=(24, 16), depths=(2, 1))
 PAPER = replace(SMALL, widths=(128, 256), depths=(4, 5), features=32)
@@ -167,13 +170,34 @@ def test_a_drawn_ray_is_that_of_its_pixel_with_its_colour_and_mask() -> None:
 
 def test_rays_in_the_unit_sphere_pass_through_the_world_points_of_the_camera() -> None:
     picture = view(0, 14, 9, masked=False)
-    origins, directions = camera_rays(picture.camera.moved(WORLD))
-    assert origins.shape == directions.shape == (14 * 9, 3)
-    there = WORLD.to_input((origins + 2.5 * directions).double().numpy())
+    eye, directions = picture.camera.moved(WORLD).rays()
+    there = WORLD.to_input((eye + 2.5 * directions).double().reshape(-1, 3).numpy())
     pixels, depth = picture.camera.project(torch.from_numpy(there))
     y, x = np.mgrid[:9, :14]
     assert np.allclose(pixels.numpy(), np.stack((x.ravel(), y.ravel()), axis=1), atol=1e-4)
     assert bool((depth > 0).all())
+
+
+def by_brute_force(camera: Camera) -> Tensor:
+    """Which pixels' rays meet the unit sphere, by the rays of all of them."""
+    eye, directions = camera.rays(dtype=torch.float64)
+    near, far = sphere_span(eye.expand_as(directions).reshape(-1, 3), directions.reshape(-1, 3))
+    return (far > near).reshape(directions.shape[:2])
+
+
+@pytest.mark.parametrize("distance", [0.3, 0.9, 1.1, 2.0, 5.0])
+def test_the_rays_that_meet_the_sphere_are_those_of_all_pixels_that_do(distance: float) -> None:
+    random, kinds = np.random.default_rng(0), set()
+    for _ in range(20):
+        eye, target = distance * unit_rows(random.normal(size=(1, 3)))[0], random.normal(size=3)
+        lens = intrinsics(*random.uniform(10, 60, size=2), *random.uniform(0, 40, size=2))
+        pose = look_at(eye.tolist(), target.tolist(), width=1, height=1).world_from_camera
+        camera = Camera(lens, pose, 43, 31)
+        expected = by_brute_force(camera).numpy()
+        # In float64 the sides differ by some 1e-15 at most, which no random pixel is from the border.
+        assert np.array_equal(meets_sphere(camera), expected)
+        kinds |= {bool(expected.any()), bool(expected.all())}
+    assert kinds == {True, False} if distance > 1 else kinds == {True}
 
 
 def test_pixels_that_miss_the_sphere_are_never_drawn_and_all_others_are() -> None:
@@ -181,8 +205,7 @@ def test_pixels_that_miss_the_sphere_are_never_drawn_and_all_others_are() -> Non
     pool = RayPool(pictures, WORLD, CPU)
     expected = set()
     for index, picture in enumerate(pictures):
-        near, far = sphere_span(*camera_rays(picture.camera.moved(WORLD)))
-        meets = (far > near).reshape(picture.color.shape[:2])
+        meets = by_brute_force(picture.camera.moved(WORLD))
         expected |= {(index, y, x) for y, x in meets.nonzero().tolist()}
     everything = sum(picture.color.shape[0] * picture.color.shape[1] for picture in pictures)
     assert 0.3 * everything < len(expected) < 0.95 * everything  # a test of both kinds of pixels
@@ -198,6 +221,24 @@ def test_pixels_that_are_left_out_are_never_drawn(whole: bool) -> None:
     everything, rest = (places(RayPool(pictures, WORLD, CPU, whole=whole, left_out=out)) for out in ({}, {1: hole}))
     assert set(rest) == {(number, y, x) for number, y, x in everything if number != 1 or not hole[y, x]}
     assert len(set(rest)) < len(set(everything))
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_pixel_s_number_says_its_view_and_place(whole: bool) -> None:
+    pictures = views()
+    hole = np.zeros((12, 8), dtype=bool)
+    hole[3:9, 2:6] = True
+    pool = RayPool(pictures, WORLD, CPU, whole=whole, left_out={1: hole})
+    expected = []
+    for index, picture in enumerate(pictures):
+        chosen = by_brute_force(picture.camera.moved(WORLD)).numpy() | whole
+        y, x = np.nonzero(chosen & ~hole if index == 1 else chosen)
+        expected.append(np.stack((np.full_like(x, index), x, y), axis=1))
+    view, place = pool.places(torch.arange(len(pool)))
+    assert np.array_equal(torch.column_stack((view, place)).numpy(), np.concatenate(expected))
+    # The colours spell (view, y, x).
+    assert torch.equal(pool.colors.long(), torch.column_stack((view, place.flip(1))))
+    assert pool.colors.dtype == torch.uint8
 
 
 def test_all_pixels_are_equally_likely() -> None:

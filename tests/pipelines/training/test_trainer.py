@@ -187,6 +187,27 @@ def test_a_strip_has_the_mean_of_what_was_known_and_of_what_is_said() -> None:
     torch.testing.assert_close(sampler.errors, torch.tensor([(1 + 0.2 + 0.6) / 3, 2.0, 1.0, 1.0, 1.0, 1.0]))
 
 
+def test_probabilities_are_updated_in_place_every_sixteen_steps() -> None:
+    sampler, kept = ErrorWeightedSampler(PIXELS, 0.5, CPU), {}
+    kept |= sampler.kept
+    bounds = sampler.bounds
+    sampler.at_step(0, kept).learn(torch.arange(STRIP), torch.zeros(STRIP))
+    for step in range(1, 16):
+        assert sampler.at_step(step, kept).bounds.tolist() == [1, 2, 3, 4, 5, 6]
+    first = 1 / (1 + STRIP)
+    expected = torch.arange(6, dtype=torch.float64) + first
+    torch.testing.assert_close(sampler.at_step(16, kept).bounds, expected, atol=1e-6, rtol=0)
+    assert sampler.bounds is bounds  # which recorded steps read
+
+
+def test_state_of_other_strips_begins_anew() -> None:
+    old, sampler = (ErrorWeightedSampler(PIXELS, 0.5, CPU, strip=strip) for strip in (STRIP, 4 * STRIP))
+    kept = {name: tensor + 1 for name, tensor in old.kept.items()}
+    rows = sampler.at_step(1, kept).rows(1000, generator())
+    assert kept["errors"].tolist() == [1, 1]
+    assert 0 <= int(rows.min()) < STRIP < PIXELS - STRIP < int(rows.max()) < PIXELS
+
+
 def test_without_a_share_pixels_are_drawn_by_chance_and_nothing_is_learnt() -> None:
     sampler = ErrorWeightedSampler(PIXELS, 0.0, CPU)
     sampler.learn(torch.arange(PIXELS), torch.zeros(PIXELS))
