@@ -43,7 +43,7 @@ class UnitRange(Generic[N]):
 
     def __get__(self, instance: Any, owner: type) -> N:
         kept = instance.__dict__[self.name]  # of the class an AttributeError: a field without a default
-        return kept if kept is None else cast(N, unit_range(kept))
+        return cast(N, kept if kept is None else unit_range(kept))
 
     def __set__(self, instance: Any, numbers: N | NDArray[np.integer]) -> None:
         if numbers is not None and numbers.dtype.kind == "f":
