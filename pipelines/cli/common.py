@@ -86,10 +86,11 @@ def training(
 
 
 def tell_budget(record: Mapping[str, Any], name: str = "") -> None:
-    """Warn, on stderr, of what a time budget has changed, as ``record``, a part of ``run.json``, has it."""
+    """Warn, on stderr, of what a time budget or noise has changed, as ``record``, a part of ``run.json``, has it."""
     budget = record.get("budget", {})
     for note in budget.get("notes", []):
-        print(f"warning: --time-budget {budget['seconds']:g}: {name}{note}", file=sys.stderr)
+        limit = "" if budget["seconds"] is None else f"--time-budget {budget['seconds']:g}: "
+        print(f"warning: {limit}{name}{note}", file=sys.stderr)
 
 
 # --- converters for argparse ---

@@ -19,7 +19,7 @@ from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss,
 from ..training.settings import EvolveConfig, FitConfig
 from ..training.trainer import Group, Objective, seeded, warm_cosine, without_prefix
 from .cloud import drawn
-from .samples import LEAST, SQUARES, RobustScales, Samples, Source, with_previous
+from .samples import LEAST, SQUARES, RobustScales, Samples, Source, at_feet, with_previous
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class Verdict(NamedTuple):
     fall: Fall
     learnt: float = 1.0  # root mean square of |f| at the training points over that without the level
     guessed: bool = False  # whether the normals were estimated
-    noisy: bool = False  # whether the points have their noise, so that the loss is f² alone
+    noisy: bool = False  # whether the points, then of estimated normals, have their noise
 
     @property
     def better(self) -> bool:
@@ -190,13 +190,12 @@ class Verdict(NamedTuple):
         The loss weighs distance and angle as the training does. Either may grow where the surface comes nearer: the
         distance to points that smoothing has rounded off, the angle to normals of vertices, which are means of those of
         faces. Estimated normals share the noise of the points: with them the distance may not be significantly more.
-        The noise of points that were set apart is independent of the level: f² there falls where the surface comes
-        nearer to the truth. The last weights are judged there, as the best of several looks would fall by chance.
+        The noise of points that were set apart is independent of the level: |f| there falls where the surface comes
+        nearer to the truth. This fall is often less than its standard error, so that a level is kept if |f| does not
+        rise significantly. The last weights are judged, as the best of several looks would fall by chance.
         """
-        if self.noisy:
-            return self.after.loss < self.before.loss
         sound = self.fall.distance > -JUDGE.surely if self.guessed else self.after.loss < self.before.loss
-        return (max(self.fall) > JUDGE.surely and sound) or self.learns
+        return sound if self.noisy else (max(self.fall) > JUDGE.surely and sound) or self.learns
 
     @property
     def learns(self) -> bool:
@@ -217,7 +216,7 @@ class Verdict(NamedTuple):
         errors = f"mean distance {distance.format('')}, mean angle of the normals {angle.format('°')}"
         errors += f", loss {self.before.loss:.3g} → {self.after.loss:.3g}"
         if self.noisy:
-            errors += ", the mean square of noisy points' distances"
+            errors += "; these points have their noise"
         elif self.learns and max(self.fall) <= JUDGE.surely:
             errors += f"; at the points it was trained on the root mean square is {self.learnt:.2f} of what it was"
         return f"level {level} {judged}: without it → with it, at {self.points:,} points held out: {errors}"
@@ -284,14 +283,17 @@ class Judge:
         self.options = options
         areas = torch.ones(len(points)) if areas is None else areas
         samples = Samples(points, distance=torch.zeros(len(points)), normal=normals, area=areas)
-        self.samples = with_previous(samples, previous, delta, device=previous.like.device)
+        device = previous.like.device
+        self.samples = (
+            at_feet(samples, previous, device=device) if noisy else with_previous(samples, previous, delta, device=device)
+        )
         self.data, self.normal, self.count = data, normal, len(self.samples)
         self.guessed, self.noisy = guessed, noisy
         self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing, options=self.options))
         assert self.samples.value is not None
         assert self.samples.gradient is not None
         # Squares of distances at level 1 are mostly those of few points that level 0 has missed.
-        usual = math.inf if noisy or not self.count else float(self.samples.value.square().median())
+        usual = math.inf if not self.count else float(self.samples.value.square().median())
         self.scales = scales._replace(data=min(scales.data, max(usual, LEAST.data)))
         self.without = self._errors(self.samples.value, self.samples.gradient)
         self.before = self.without.mean()
@@ -306,8 +308,8 @@ class Judge:
         return self._errors(value + jet.value, gradient + jet.gradient)
 
     def score(self, error: Error) -> float:
-        """What the best weights have least of: the loss, or the distance where normals were estimated without noise."""
-        return error.distance if self.guessed and not self.noisy else error.loss
+        """What the best weights have least of: the loss, or the distance where normals were estimated."""
+        return error.distance if self.guessed else error.loss
 
     def verdict(self, each: Each, at: float) -> Verdict:
         """The verdict on a level with these errors, kept after the fraction ``at`` of its steps."""
@@ -406,7 +408,7 @@ class LevelObjective(Objective):
         if self.judge is None:
             return False
         done, at, least = (float(self.kept[name]) for name in ("averaged", "at", "least"))
-        useless = done >= JUDGE.hopeless and least >= self.judge.score(self.judge.before)
+        useless = not self.judge.noisy and done >= JUDGE.hopeless and least >= self.judge.score(self.judge.before)
         return useless or (math.isfinite(least) and done >= at + JUDGE.patience)
 
     def take_best(self) -> Verdict | None:

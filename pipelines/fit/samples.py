@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...neural_fields import Field, InputError, Jet
+from ...neural_fields import Field, InputError
 from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss
 from ..training.settings import FitConfig
 from .cloud import CLOUD, CloudDistance
@@ -326,17 +326,33 @@ def band_samples(cloud: CloudDistance, delta: float, count: int, *, generator: t
 @torch.no_grad()
 def with_previous(samples: Samples, field: Field, delta: float, *, device: torch.device) -> Samples:
     """Add value and gradient of the frozen levels, and drop samples outside ``|f| < delta`` or a coarser band."""
-    points = samples.points.to(device)
-    jets = [field.jet(part) for part in points.split(1 << 16)]
-    jet = Jet(*(torch.cat(parts) for parts in zip(*jets, strict=True)))
-    size = jet.value.abs()
+    full = _with_jets(samples.to(device), field)
+    assert full.value is not None
+    size = full.value.abs()
     kept = size < delta
     if field.num_levels > 1:  # values below every δ are inside all bands
         unsure = (kept & (size >= field.deltas.min())).nonzero()[:, 0]
-        kept[unsure] = field.in_band(points[unsure], level=field.num_levels - 1)
-    moved = samples.to(device)
-    full = Samples(points, moved.distance, moved.normal, jet.value, jet.gradient, moved.area)
+        kept[unsure] = field.in_band(full.points[unsure], level=field.num_levels - 1)
     return full.take(kept.nonzero()[:, 0])
+
+
+@torch.no_grad()
+def at_feet(samples: Samples, field: Field, *, device: torch.device) -> Samples:
+    """Samples moved by −f ∇f / |∇f| onto the surface of the frozen levels, with the jets of where they came from.
+
+    A residual level changes the distance of a point to the surface by its value at the foot, however far the point is.
+    """
+    full = _with_jets(samples.to(device), field)
+    assert full.value is not None
+    assert full.gradient is not None
+    step = full.value[:, None] * torch.nn.functional.normalize(full.gradient, dim=1)
+    return replace(full, points=full.points - step)
+
+
+def _with_jets(samples: Samples, field: Field) -> Samples:
+    jets = [field.jet(part) for part in samples.points.split(1 << 16)]
+    value, gradient, _ = (torch.cat(parts) for parts in zip(*jets, strict=True))
+    return replace(samples, value=value, gradient=gradient)
 
 
 @dataclass(frozen=True)

@@ -179,6 +179,9 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         self.keep_support()
         levels = self.config.num_levels
         for level in range(len(self.stages), levels):
+            if level > 1 and self.omega(level) < min(self.config.omegas[level], 1.001 * self.stages[-1]["omega"]):
+                self.budget.leave_out(level, levels, "noise allows no higher frequency than that of the level before")
+                break
             left, training = self.budget.left(), 1 - BUDGET.sampling_share
             share = self.share(level, self.config.steps[:levels], left, training=training)
             if share is None:
@@ -386,8 +389,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         areas, normals = torch.from_numpy(index.gaps[rows]) ** 2, self.normals[self.held]
         terms: dict[str, Any] = {"data": surface.data, "normal": surface.normal, "scales": surface.scales}
         if noisy is not None:
-            normals = torch.from_numpy(index.normals[rows])
-            terms = {"data": 1.0, "normal": 0.0, "noisy": True}
+            normals, terms["noisy"] = torch.from_numpy(index.normals[rows]), True
         about = {"spacing": self.spacing, "areas": areas, "guessed": self.cloud.estimated}
         judge = Judge(points, normals, self.frozen, delta, **about, **terms)
         return judge if judge.count >= JUDGE.fewest / 2 else None

@@ -94,15 +94,17 @@ class Budget:
             return seconds * work[0] / math.fsum(work)
         return seconds if begun or level == 0 else None
 
-    def leave_out(self, first: int, levels: int) -> None:
-        """Record that the levels from ``first`` up to ``levels`` are not trained."""
+    def leave_out(
+        self, first: int, levels: int, why: str = f"too little time for {BUDGET.fewest_steps} steps"
+    ) -> None:
+        """Record that the levels from ``first`` up to ``levels`` are not trained, and why."""
         self.left_out = list(range(first, levels))
         names = f"level {first} is" if len(self.left_out) == 1 else f"levels {first} to {levels - 1} are"
-        self.notes.append(f"{names} left out: too little time for {BUDGET.fewest_steps} steps")
+        self.notes.append(f"{names} left out: {why}")
 
     def record(self) -> dict[str, Any]:
         """For ``run.json``."""
-        if self.seconds is None:
+        if self.seconds is None and not self.notes:
             return {}
         return {"budget": {"seconds": self.seconds, "left_out": self.left_out, "notes": self.notes}}
 

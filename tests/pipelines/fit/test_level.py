@@ -25,7 +25,7 @@ from mplicits.pipelines.fit.level import (
     siren_groups,
     standard_errors,
 )
-from mplicits.pipelines.fit.samples import RobustScales, Samples, Source, with_previous
+from mplicits.pipelines.fit.samples import RobustScales, Samples, Source, at_feet, with_previous
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.trainer import Group, StopFlag, Trainer
 
@@ -278,23 +278,31 @@ def test_a_level_is_kept_if_it_is_surely_better() -> None:
         assert not any(verdict_of(*falls)._replace(**known).better for falls in silenced)
 
 
-def test_the_mean_square_at_noisy_points_falls_where_the_surface_comes_nearer() -> None:
-    # Half of the points are `high` above the sphere, half below: the mean square is high² plus that of the error.
+def test_noisy_points_judge_by_their_mean_distance_beyond_the_band_too() -> None:
+    # Heights uniform in ±h and an error e of the surface have the mean |f| = (h² + e²) / 2h.
     high, x = 2 * OFF, points(1000)
-    noisy = x * (1 + torch.where(torch.arange(1000) % 2 == 0, high, -high)[:, None] / RADIUS)
-    frozen, about = Sphere(radius=RADIUS - OFF), {"spacing": SPACING, "data": 1.0, "normal": 0.0, "noisy": True}
-    judge = Judge(noisy, x / RADIUS, frozen, 0.1, **about)
-    for error, kept in ((0.1 * OFF, True), (-0.9 * OFF, True), (1.1 * OFF, False), (-1.1 * OFF, False)):
+    heights = high * (2 * (torch.arange(1000) * 0.618034 % 1) - 1)  # evenly spread, by the golden ratio
+    noisy, about = x * (1 + heights[:, None] / RADIUS), {"spacing": SPACING, "data": 1.0, "normal": 0.0}
+    judge = Judge(noisy, x / RADIUS, Sphere(radius=RADIUS - OFF), OFF, guessed=True, noisy=True, **about)
+    assert judge.count == 1000  # half of them are outside of the band
+    for error, kept in ((0.1 * OFF, True), (-0.9 * OFF, True), (-1.05 * OFF, True), (1.5 * OFF, False)):
         verdict = judge.verdict(judge.errors(zero_siren(error - OFF)), 1.0)
-        assert verdict.before.loss == pytest.approx(high**2 + OFF**2, rel=1e-5)
-        assert verdict.after.loss == pytest.approx(high**2 + error**2, rel=1e-5)
+        assert verdict.before.distance == pytest.approx((high**2 + OFF**2) / 2 / high, rel=0.01)
+        assert verdict.after.distance == pytest.approx((high**2 + error**2) / 2 / high, rel=0.01)
         assert verdict.better is kept
+
+
+def test_feet_are_on_the_surface_and_keep_their_distances() -> None:
+    x = points(100) * (0.4 + 1.2 * torch.arange(100)[:, None] / 100)
+    feet = at_feet(Samples(x), Sphere(radius=RADIUS), device=CPU)
+    torch.testing.assert_close(feet.points.norm(dim=1), torch.full((100,), RADIUS), rtol=1e-6, atol=0)
+    torch.testing.assert_close(feet.value, x.norm(dim=1) - RADIUS, rtol=0, atol=1e-6)
 
 
 def test_noisy_points_judge_the_last_weights() -> None:
     # The best of several looks would be better by chance.
     x, normals = points(1000), points(1000) / RADIUS
-    about = {"spacing": SPACING, "data": 1.0, "normal": 0.0, "noisy": True}
+    about = {"spacing": SPACING, "data": 1.0, "normal": 0.0, "guessed": True, "noisy": True}
     learner = objective(Judge(x, normals, Sphere(radius=RADIUS - OFF), 0.1, **about), 0.0)
     for bias, done in ((-OFF, 0.3), (-0.5 * OFF, 0.6)):
         torch.nn.init.constant_(learner.siren.output.bias, bias)
