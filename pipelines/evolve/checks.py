@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ...neural_fields import Field, NoSurfaceError, Similarity, TimeSlice, extract_mesh
+from ..fit.samples import value_and_gradient
 from ..surface.measure import chamfer
 from ..surface.surface import sample_points, volume
 from .problem import End
@@ -160,10 +160,5 @@ def frame_figures(field: Field, time: float, resolution: int) -> FrameFigures:
     surface = surface_of(still, resolution=resolution)
     if surface is None:
         return FrameFigures(time, 0.0, 0, 0, None)
-    slope = _slopes(still, torch.from_numpy(surface.vertices).float())
+    slope = value_and_gradient(still, torch.from_numpy(surface.vertices).float())[1].norm(dim=1)
     return FrameFigures(time, volume(surface), *topology_of(surface), float((slope - 1).abs().mean()))
-
-
-@torch.no_grad()
-def _slopes(field: Field, points: Tensor) -> Tensor:
-    return torch.cat([field.jet(part).gradient.norm(dim=1) for part in points.split(1 << 16)])

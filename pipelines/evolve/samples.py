@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...neural_fields import Field, at_time, flow
 from ...neural_fields.spacetime.evolution import VectorField
-from ..fit.samples import DOMAIN, Rows
+from ..fit.samples import DOMAIN, Rows, value_and_gradient
 from .shapes import StaticShape
 
 
@@ -86,9 +86,7 @@ def signs(samples: Known, tolerance: float = 1e-3) -> tuple[Known, Bounds]:
 def known_at(shape: StaticShape, time: float, count: int, seed: int, generator: torch.Generator) -> Known:
     """Samples of a shape at the time when it is reached."""
     points = around(shape, count, seed, generator)
-    jets = [shape.field.jet(part) for part in points.split(1 << 16)]
-    value, gradient = torch.cat([jet.value for jet in jets]), torch.cat([jet.gradient for jet in jets])
-    return Known(at_time(points, time), value.detach(), gradient.detach())
+    return Known(at_time(points, time), *value_and_gradient(shape.field, points))
 
 
 def around(shape: StaticShape, count: int, seed: int, generator: torch.Generator) -> Tensor:

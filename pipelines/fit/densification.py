@@ -82,10 +82,10 @@ def dense_distance(
     new = min(count - len(points), math.ceil(wanted.sum()))
     if new <= 0:
         return index
-    noisy = guessed and noise > 0
-    found = densified(index.points, index.normals, new, share=wanted, guessed=noisy, seed=seed, options=options)
+    found = densified(index.points, index.normals, new, share=wanted, seed=seed, options=options)
     new_points, new_normals = (torch.from_numpy(a.astype(np.float32)) for a in (found.points, found.new_normals))
-    if noisy and _on_solid(index, index.points[:: 1 + len(points) // options.tested], options).mean() > options.closed:
+    tested = index.points[:: 1 + len(points) // options.tested]
+    if guessed and noise and _on_solid(index, tested, options).mean() > options.closed:
         kept = torch.from_numpy(_on_solid(index, new_points.numpy(), options))
         new_points, new_normals = new_points[kept], new_normals[kept]
     own_normals = torch.from_numpy(found.normals.astype(np.float32))
@@ -105,7 +105,6 @@ def densified(
     count: int,
     *,
     share: NDArray[np.floating] | None = None,
-    guessed: bool = False,
     seed: int = 0,
     options: DensificationOptions = DENSIFICATION,
 ) -> Densified:
@@ -115,10 +114,9 @@ def densified(
     least-squares fit of n_j − n_i ≈ S_i (p_j − p_i) over neighbours on an arc of circle with it, ½(n_i + n_j)·(p_j −
     p_i) ≈ 0. New points are zeros of the patches around them, blended as in moving least squares surfaces (Kolluri,
     SODA 2005). Only patches with agreeing normals are blended (Öztireli, Guennebaud and Gross, 2009), and places beyond
-    an edge or with contradicting patches stay empty: edges stay sharp.
+    an edge, with contradicting patches or without points on all sides stay empty: edges stay sharp.
 
-    ``count`` candidates are drawn, in proportion to ``share`` ``(N,)`` beside each point (None: by area). With
-    ``guessed`` normals, estimated from noise, new points must have points on all sides.
+    ``count`` candidates are drawn, in proportion to ``share`` ``(N,)`` beside each point (None: by area).
     """
     if len(points) <= options.neighbors:  # too few for a neighbourhood that is not the whole
         return Densified(normals.astype(np.float64), 0, np.empty((0, 3)), np.empty((0, 3)))
@@ -133,7 +131,7 @@ def densified(
         # Sorted, so that neighbours are near in memory.
         parents = np.sort(random.choice(able, count, p=chance / chance.sum()))
         for start in range(0, count, options.block):
-            found.append(_placed(patches, parents[start : start + options.block], random, guessed=guessed))
+            found.append(_placed(patches, parents[start : start + options.block], random))
     new = [np.concatenate(columns) for columns in zip(*found, strict=True)]
     return Densified(fixed, repaired, new[0], new[1])
 
@@ -232,7 +230,7 @@ def _repaired(patches: _Patches) -> tuple[Float64, int]:
     return fixed, int(torn.sum())
 
 
-def _placed(patches: _Patches, parents: Rows, random: np.random.Generator, *, guessed: bool) -> tuple[Float64, Float64]:
+def _placed(patches: _Patches, parents: Rows, random: np.random.Generator) -> tuple[Float64, Float64]:
     """New points and their normals, at most one beside each of ``parents``."""
     normal = patches.normals[parents]
     step = random.normal(size=(len(parents), 3))
@@ -241,14 +239,13 @@ def _placed(patches: _Patches, parents: Rows, random: np.random.Generator, *, gu
     bent = np.einsum("mab,mb->ma", patches.shape[parents], step)
     x = patches.points[parents] + step - 0.5 * (bent * step).sum(axis=1, keepdims=True) * normal
     normal, good = _unit(normal + bent), np.ones(len(parents), bool)
-    one_sided = patches.options.one_sided if guessed else np.inf
     for _ in range(2):  # patches are flat across a spacing: the second move is a hundredth of the first
-        moved, normal, good = _blended(patches, x, normal, one_sided)
+        moved, normal, good = _blended(patches, x, normal)
         x = x + moved
     return x[good], normal[good]
 
 
-def _blended(patches: _Patches, x: Float64, normal: Float64, one_sided: float) -> tuple[Float64, Float64, Mask]:
+def _blended(patches: _Patches, x: Float64, normal: Float64) -> tuple[Float64, Float64, Mask]:
     """Moves of places ``(m, 3)`` onto the blend of patches, its normals, and which places are good."""
     options = patches.options
     distance, found, offset, value, theirs = patches.at(x, options.blended)
@@ -270,7 +267,7 @@ def _blended(patches: _Patches, x: Float64, normal: Float64, one_sided: float) -
     beyond &= np.minimum(np.abs(above), np.abs(below)) > options.beyond * scale
     middle = np.linalg.norm(np.einsum("mk,mkd->md", weight, offset), axis=1, keepdims=True)
     good = (total > options.enough) & (spread < options.spread * scale) & ~beyond.any(axis=1, keepdims=True)
-    good = (good & (middle < one_sided * scale))[:, 0]
+    good = (good & (middle < options.one_sided * scale))[:, 0]
     return -mean * blend, blend, good
 
 

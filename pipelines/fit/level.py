@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -191,8 +192,8 @@ class Verdict(NamedTuple):
         distance to points that smoothing has rounded off, the angle to normals of vertices, which are means of those of
         faces. Estimated normals share the noise of the points: with them the distance may not be significantly more.
         The noise of points that were set apart is independent of the level: |f| there falls where the surface comes
-        nearer to the truth. This fall is often less than its standard error, so that a level is kept if |f| does not
-        rise significantly. The last weights are judged, as the best of several looks would fall by chance.
+        nearer to the truth, often by less than its standard error. So a level is kept unless it rises significantly,
+        with its last weights: the best of several looks would fall by chance.
         """
         sound = self.fall.distance > -JUDGE.surely if self.guessed else self.after.loss < self.before.loss
         return sound if self.noisy else (max(self.fall) > JUDGE.surely and sound) or self.learns
@@ -215,9 +216,7 @@ class Verdict(NamedTuple):
         distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}{{}} ({_sure(fall)})" for b, a, fall, unit in pairs)
         errors = f"mean distance {distance.format('')}, mean angle of the normals {angle.format('°')}"
         errors += f", loss {self.before.loss:.3g} → {self.after.loss:.3g}"
-        if self.noisy:
-            errors += "; these points have their noise"
-        elif self.learns and max(self.fall) <= JUDGE.surely:
+        if not self.noisy and self.learns and max(self.fall) <= JUDGE.surely:
             errors += f"; at the points it was trained on the root mean square is {self.learnt:.2f} of what it was"
         return f"level {level} {judged}: without it → with it, at {self.points:,} points held out: {errors}"
 
@@ -260,8 +259,7 @@ class Judge:
     """The errors of a level at ``points`` ``(n, 3)`` that it is not trained on.
 
     They are means over the surface, by ``areas`` ``(n,)``, of the points in the band of half-width ``delta`` around
-    ``previous``. The loss is Eq. 4 without its eikonal term: where a level overfits noise, it rises at held-out points.
-    A level is kept if it falls, and distances or angles significantly: squares are mostly those of few points at edges.
+    ``previous``, or of all points if they are ``noisy``, see `at_feet`. The loss is Eq. 4 without its eikonal term.
     """
 
     def __init__(
@@ -283,10 +281,8 @@ class Judge:
         self.options = options
         areas = torch.ones(len(points)) if areas is None else areas
         samples = Samples(points, distance=torch.zeros(len(points)), normal=normals, area=areas)
-        device = previous.like.device
-        self.samples = (
-            at_feet(samples, previous, device=device) if noisy else with_previous(samples, previous, delta, device=device)
-        )
+        placed = at_feet if noisy else partial(with_previous, delta=delta)
+        self.samples = placed(samples, previous, device=previous.like.device)
         self.data, self.normal, self.count = data, normal, len(self.samples)
         self.guessed, self.noisy = guessed, noisy
         self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing, options=self.options))

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ...datasets.clouds.cleaning.outliers import agreement, unsupported
 from ...neural_fields import Field
+from .samples import value_and_gradient
 
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -77,9 +78,7 @@ def review_points(
     mean normal of its neighbours, which the gradient follows. With ``patches``, where signs were guessed, patches of
     normals that oppose the gradient and the normals around them are turned too.
     """
-    jets = [coarse.jet(part.to(device), level=0) for part in points.split(1 << 16)]
-    value = torch.cat([jet.value for jet in jets]).cpu()
-    slope = torch.cat([jet.gradient for jet in jets]).cpu()
+    value, slope = (part.cpu() for part in value_and_gradient(coarse, points.to(device), level=0))
     gradient = torch.nn.functional.normalize(slope, dim=1)
     cosine = (gradient * normals).sum(dim=1)
     scale = options.mad * float(value.abs().median())

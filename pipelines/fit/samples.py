@@ -323,36 +323,34 @@ def band_samples(cloud: CloudDistance, delta: float, count: int, *, generator: t
     return Samples(torch.from_numpy(cloud.points)[index] + shift)
 
 
-@torch.no_grad()
 def with_previous(samples: Samples, field: Field, delta: float, *, device: torch.device) -> Samples:
     """Add value and gradient of the frozen levels, and drop samples outside ``|f| < delta`` or a coarser band."""
-    full = _with_jets(samples.to(device), field)
-    assert full.value is not None
-    size = full.value.abs()
+    moved = samples.to(device)
+    value, gradient = value_and_gradient(field, moved.points)
+    size = value.abs()
     kept = size < delta
     if field.num_levels > 1:  # values below every δ are inside all bands
         unsure = (kept & (size >= field.deltas.min())).nonzero()[:, 0]
-        kept[unsure] = field.in_band(full.points[unsure], level=field.num_levels - 1)
-    return full.take(kept.nonzero()[:, 0])
+        kept[unsure] = field.in_band(moved.points[unsure], level=field.num_levels - 1)
+    return replace(moved, value=value, gradient=gradient).take(kept.nonzero()[:, 0])
 
 
-@torch.no_grad()
 def at_feet(samples: Samples, field: Field, *, device: torch.device) -> Samples:
-    """Samples moved by −f ∇f / |∇f| onto the surface of the frozen levels, with the jets of where they came from.
+    """Samples moved by −f ∇f / |∇f| onto the surface of the frozen levels, with value and gradient of where they were.
 
     A residual level changes the distance of a point to the surface by its value at the foot, however far the point is.
     """
-    full = _with_jets(samples.to(device), field)
-    assert full.value is not None
-    assert full.gradient is not None
-    step = full.value[:, None] * torch.nn.functional.normalize(full.gradient, dim=1)
-    return replace(full, points=full.points - step)
+    moved = samples.to(device)
+    value, gradient = value_and_gradient(field, moved.points)
+    feet = moved.points - value[:, None] * torch.nn.functional.normalize(gradient, dim=1)
+    return replace(moved, points=feet, value=value, gradient=gradient)
 
 
-def _with_jets(samples: Samples, field: Field) -> Samples:
-    jets = [field.jet(part) for part in samples.points.split(1 << 16)]
-    value, gradient, _ = (torch.cat(parts) for parts in zip(*jets, strict=True))
-    return replace(samples, value=value, gradient=gradient)
+@torch.no_grad()
+def value_and_gradient(field: Field, points: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
+    """Value ``(N,)`` and gradient ``(N, 3)`` at points ``(N, 3)``, in parts that bound memory."""
+    value, gradient, _ = zip(*(field.jet(part, level=level) for part in points.split(1 << 16)), strict=True)
+    return torch.cat(value), torch.cat(gradient)
 
 
 @dataclass(frozen=True)

@@ -179,7 +179,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         self.keep_support()
         levels = self.config.num_levels
         for level in range(len(self.stages), levels):
-            if level > 1 and self.omega(level) < min(self.config.omegas[level], 1.001 * self.stages[-1]["omega"]):
+            if level > 1 and self.omega(level) <= self.stages[-1]["omega"] < self.config.omegas[level]:
                 self.budget.leave_out(level, levels, "noise allows no higher frequency than that of the level before")
                 break
             left, training = self.budget.left(), 1 - BUDGET.sampling_share
@@ -386,12 +386,11 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             return None
         assert self.frozen is not None
         rows = index.nearest_rows(points.numpy())[1]
-        areas, normals = torch.from_numpy(index.gaps[rows]) ** 2, self.normals[self.held]
+        normals = self.normals[self.held] if noisy is None else torch.from_numpy(index.normals[rows])
         terms: dict[str, Any] = {"data": surface.data, "normal": surface.normal, "scales": surface.scales}
-        if noisy is not None:
-            normals, terms["noisy"] = torch.from_numpy(index.normals[rows]), True
-        about = {"spacing": self.spacing, "areas": areas, "guessed": self.cloud.estimated}
-        judge = Judge(points, normals, self.frozen, delta, **about, **terms)
+        about = {"spacing": self.spacing, "guessed": self.cloud.estimated, "noisy": noisy is not None}
+        areas = torch.from_numpy(index.gaps[rows]) ** 2
+        judge = Judge(points, normals, self.frozen, delta, areas=areas, **about, **terms)
         return judge if judge.count >= JUDGE.fewest / 2 else None
 
     def review(self) -> dict[str, Any]:

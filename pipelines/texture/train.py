@@ -26,7 +26,7 @@ from ...neural_fields.checkpoint import texture_bytes
 from ...neural_fields.fields.losses import color_loss, tangential_loss
 from ...neural_fields.networks.colors import ColorSiren
 from ...neural_fields.spacetime.dynamic_tracing import moment
-from ..fit.samples import DOMAIN
+from ..fit.samples import DOMAIN, value_and_gradient
 from ..training.folder import (
     TEXTURE_FILE,
     RunFolder,
@@ -143,9 +143,9 @@ def band_directions(
     index = torch.randint(len(samples.points), (count,), generator=generator)
     shift = (2 * torch.rand(count, 3, generator=generator) - 1) * delta
     points = samples.points[index.to(samples.points.device)] + shift.to(samples.points)
-    jets = [geometry.jet(part, level=level) for part in points.split(1 << 17)]
-    kept = (torch.cat([jet.value for jet in jets]).abs() < delta).nonzero()[:, 0]
-    return BandSamples(points[kept], torch.cat([jet.gradient for jet in jets])[kept])
+    value, gradient = value_and_gradient(geometry, points, level=level)
+    kept = (value.abs() < delta).nonzero()[:, 0]
+    return BandSamples(points[kept], gradient[kept])
 
 
 # A band at least this wide (in units of the field) holds decimated meshes, and the surfaces of small networks.

@@ -94,13 +94,11 @@ class Budget:
             return seconds * work[0] / math.fsum(work)
         return seconds if begun or level == 0 else None
 
-    def leave_out(
-        self, first: int, levels: int, why: str = f"too little time for {BUDGET.fewest_steps} steps"
-    ) -> None:
+    def leave_out(self, first: int, levels: int, why: str = "") -> None:
         """Record that the levels from ``first`` up to ``levels`` are not trained, and why."""
         self.left_out = list(range(first, levels))
         names = f"level {first} is" if len(self.left_out) == 1 else f"levels {first} to {levels - 1} are"
-        self.notes.append(f"{names} left out: {why}")
+        self.notes.append(f"{names} left out: {why or f'too little time for {BUDGET.fewest_steps} steps'}")
 
     def record(self) -> dict[str, Any]:
         """For ``run.json``."""
