@@ -22,7 +22,7 @@ from ..training.settings import FitConfig
 from ..training.trainer import Group, Objective, Report, StopFlag, Trainer, warm_cosine
 from .cloud import CloudDistance
 from .level import new_level
-from .samples import SAMPLING, spread_points
+from .samples import SAMPLING, spread_points, value_and_gradient
 
 Float32 = NDArray[np.float32]
 
@@ -128,8 +128,7 @@ def give_signs(
         trainer = Trainer(objective, stage=stage, steps=options.steps)
         if not trainer.run(flag, report=report):
             return None
-        with torch.no_grad():
-            gradient = torch.cat([siren.jet(part.to(device)).gradient.cpu() for part in points.split(1 << 16)])
+        gradient = value_and_gradient(siren, points.to(device))[1].cpu()
         found.append(((gradient * normals).sum(dim=1), source))
     slope, source = max(found, key=lambda one: float(one[0].abs().mean()))
     clear = float(slope.abs().mean())

@@ -102,9 +102,8 @@ class Budget:
 
     def record(self) -> dict[str, Any]:
         """For ``run.json``."""
-        if self.seconds is None and not self.notes:
-            return {}
-        return {"budget": {"seconds": self.seconds, "left_out": self.left_out, "notes": self.notes}}
+        about = {"seconds": self.seconds, "left_out": self.left_out, "notes": self.notes}
+        return {"budget": about} if self.seconds is not None or self.notes else {}
 
 
 def least_share(steps: int) -> float:
