@@ -30,7 +30,7 @@ class LevelOptions:
     # Output scale of an untrained residual: 0.1 tilts the normals of sparse clouds by degrees.
     residual_gain: float = 0.01
     moving_gain: float = 0.1  # the same of a residual in space and time
-    # Largest frequency of a residual times noise smoothed along estimated normals: nearest of 0.4 to 0.12 for the bunny.
+    # Largest frequency of a residual times noise that was smoothed: of 0.4 to 0.12, the nearest for the bunny.
     calm: float = 0.22
     worse: float = 2.0  # error at the points over that of the level before, above which a level is set to zero
 
