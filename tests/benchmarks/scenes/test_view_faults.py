@@ -52,7 +52,7 @@ def test_poses_are_off_by_what_is_said(images: PosedImages) -> None:
     # The mean of 120 squares of standard normal numbers is within 5 · sqrt(2 / 120) of 1, but once in a million seeds.
     for measured, expected in zip(angles_and_shifts(wide, made), (0.5, 3 * 0.005), strict=True):
         assert abs(np.square(measured).sum() / (3 * len(measured) * expected**2) - 1) < 5 * (2 / 120) ** 0.5
-    assert all(a.color is b.color for a, b in zip(wide.views, made.views, strict=True))
+    assert all(np.array_equal(a.color, b.color) for a, b in zip(wide.views, made.views, strict=True))
 
 
 def test_one_pose_looks_past_the_object_and_one_photograph_is_another_s(images: PosedImages) -> None:

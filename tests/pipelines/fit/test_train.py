@@ -4,6 +4,7 @@ import signal
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import ANY
 
 import mplicits
 import numpy as np
@@ -93,19 +94,23 @@ def test_frequencies_of_residuals_follow_the_noise_where_normals_are_guesses(fit
     assert [stage["omega"] for stage in clean["stages"]] == [10.0, 15.0]
     ball = sphere_cloud()
     noisy = ball.points + np.random.default_rng(1).normal(0, 0.35, ball.points.shape)  # a twentieth of the radius
-    small = {"widths": (16, 16, 16), "depths": (1, 1, 1), "omegas": (5.0, 8.0, 90.0), "steps": (40, 40, 40)}
+    small = {"widths": (16, 16, 16), "depths": (1, 1, 1), "omegas": (5.0, 5.2, 90.0), "steps": (40, 40, 40)}
     config = replace(SMALL, **small, learning_rates=(3e-3,) * 3, samples=6000, between=False)
     whole = fit(PointCloud(noisy), config, out=tmp_path / "whole")
     stages, noise = whole.record["stages"], whole.record["cleaning"]["smoothed_noise"]
     cap = LEVEL.calm * whole.record["similarity"]["scale"] / noise
-    assert 5 < cap < 90
-    assert [stage["omega"] for stage in stages] == pytest.approx([5.0, min(8.0, cap), cap])
+    assert 5.2 < cap < 90
+    assert [stage["omega"] for stage in stages] == pytest.approx([5.0, 5.2, cap])
 
     with pytest.raises(Interrupted):
         fit(PointCloud(noisy), config, out=tmp_path / "part", progress=interrupt("level 2", 20))
     run = fit(PointCloud(noisy), out=tmp_path / "part", resume=True)
     assert [level.omega for level in run.field.levels] == [level.omega for level in whole.field.levels]
     assert_same(run.field, whole.field)
+
+    same = fit(PointCloud(noisy), replace(config, omegas=(5.0, 90.0, 90.0), steps=(40, 5, 5))).record
+    assert [stage["omega"] for stage in same["stages"]] == pytest.approx([5.0, cap])  # noise allows no third level
+    assert same["budget"] == {"seconds": None, "left_out": [2], "notes": [ANY]}
 
 
 def test_frequencies_fall_no_lower_than_that_of_level_0() -> None:
