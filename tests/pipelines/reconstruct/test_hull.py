@@ -74,6 +74,17 @@ def test_coarse_grids_decide_nothing_that_the_fine_one_would_not(monkeypatch: py
     assert carved[32, 32, 32] > 0  # there is a hole
 
 
+def test_points_dropped_early_are_those_that_all_silhouettes_drop() -> None:
+    broken = with_masks(lambda mask: mask * (np.random.default_rng(int(mask.sum())).random(mask.shape) < 0.9))
+    for made in (images(), broken):
+        points = hull.grid_in_ball(16)[0]
+        masks = [hull.silhouette(view, made.similarity, points, 1 / 8) for view in made.views]
+        visible, objects = (torch.stack(parts).float().sum(dim=0) for parts in zip(*masks, strict=True))
+        agreed = (objects >= HULL.agree * visible) & (visible >= max(1.0, HULL.seeing * len(masks)))
+        assert torch.equal(hull._agreed(made.views, made.similarity, points, 1 / 8), agreed)
+        assert 0 < agreed.float().mean() < 1
+
+
 def test_a_gap_that_one_camera_of_many_sees_is_carved() -> None:
     views = list(images().views) * 3
     mask = np.array(views[7].mask)
