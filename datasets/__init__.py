@@ -8,7 +8,7 @@ from .clouds.readers.ply import write_cloud_ply
 from .clouds.readers.reading import read_cloud
 from .depth.camera import DepthCamera, read_intrinsics
 from .depth.cloud import DepthReport, DepthSettings, frame_cloud, fuse_frames
-from .depth.frame import RgbdFrame, read_frame, read_poses, read_trajectory
+from .depth.frame import RgbdFrame, read_frame, read_poses
 from .depth.images import read_color, read_depth
 from .files import is_depth_file
 from .synthetic.samples import add_isotropic_noise, add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
@@ -26,7 +26,7 @@ __all__ = [
     "Statue", "TexturedMesh", "add_isotropic_noise", "add_noise", "add_outliers", "colors_at", "frame_cloud",
     "fuse_frames", "is_depth_file", "linear_to_srgb", "look_at", "orbit", "prepare_cloud", "read_cameras",
     "read_cloud", "read_color", "read_depth", "read_frame", "read_intrinsics", "read_posed_images", "read_poses",
-    "read_textured", "read_trajectory", "region_from_cameras", "region_from_masks", "region_from_points",
+    "read_textured", "region_from_cameras", "region_from_masks", "region_from_points",
     "render_scene", "sample_scene", "sample_sphere", "sample_surface", "sample_textured", "sample_torus",
     "scan_with_truth", "scene_mesh", "simulate_scan", "spacing_of", "srgb_to_linear", "statue_scan", "thin",
     "turntable", "write_cloud_ply", "write_colmap", "write_neus", "write_transforms",

@@ -75,11 +75,6 @@ class DepthCamera:
         return Camera(matrix, pose, self.width, self.height, self.distortion)
 
     @property
-    def matrix(self) -> Float64:
-        """``(3, 3)``: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``."""
-        return intrinsics(self.fx, self.fy, self.cx, self.cy).numpy()
-
-    @property
     def pixel_angle(self) -> float:
         """Width of a pixel at depth 1."""
         return 1 / math.sqrt(self.fx * self.fy)
@@ -91,11 +86,6 @@ class DepthCamera:
     def unproject(self, depth: Float64) -> Float64:
         """The points ``(H, W, 3)`` in camera coordinates of pixels with depths z ``(H, W)``."""
         return self.rays().numpy() * depth[..., None]
-
-    def project(self, points: Float64) -> tuple[Float64, NDArray[np.bool_]]:
-        """Pixels ``(N, 2)`` of points ``(N, 3)`` in camera coordinates, and a mask of those in the image."""
-        pixels, _, inside = self.at(np.eye(4)).in_view(points)
-        return pixels, inside
 
 
 @reader

@@ -129,11 +129,6 @@ def read_poses(path: str | Path) -> list[PosedFrame]:
     return _file_poses(path)
 
 
-def read_trajectory(path: str | Path) -> Float64:
-    """The poses ``(F, 4, 4)`` of a file, NaN for lost ones; see `read_poses`."""
-    return np.stack([pose for _, pose, _ in read_poses(path)])
-
-
 _EXPECTED = "no poses in it; expected a trajectory.log, TUM's poses, a transforms.json, or a folder of 4 × 4 matrices"
 _OPENGL = np.diag([1.0, -1, -1, 1])  # x right, y up, z backward: the axes of ARKit and OpenGL
 

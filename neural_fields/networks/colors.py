@@ -290,17 +290,6 @@ class TextureField(OneLevelField):
         shape = (*x.shape[:-1], 3)
         return Jet(value.reshape(shape), gradient.reshape(*shape, self.in_dim), x.new_empty((*x.shape[:-1], 0)))
 
-    def derivative_along(self, x: Tensor, direction: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
-        """Colours and their derivative along ``direction``, both ``(..., 3)``: see `ColorSiren.derivative_along`."""
-        rows, inside = self._inside(x, level)
-        if direction.shape != x.shape:
-            raise ValueError(f"direction has shape {tuple(direction.shape)}; expected that of x, {tuple(x.shape)}")
-        raw, slope = self.network.derivative_along(rows[inside], direction.reshape(rows.shape)[inside])
-        value = self._background(rows).index_copy(0, inside, raw.clamp(0, 1))
-        derivative = rows.new_zeros(len(rows), 3).index_copy(0, inside, slope * _unclamped(raw))
-        shape = (*x.shape[:-1], 3)
-        return value.reshape(shape), derivative.reshape(shape)
-
     @torch.no_grad()
     def in_band(self, x: Tensor, *, level: int = -1) -> Tensor:
         """Whether ``|f(x)| < δ`` → bool ``(...,)``: where there are colours."""

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..backend.errors import at_least
 from ..fields.field import Field, Jet, SecondJet, Wrapper, solid
 from ..networks.multiscale import MultiscaleSDF, levels_of
 from ..networks.siren import Siren
@@ -89,43 +88,24 @@ class SpaceTimeSDF(Wrapper):
         return self.sdf
 
     @classmethod
-    def from_widths(
-        cls, sizes: Sequence[tuple[int, int]], *, omegas: Sequence[float], time_gain: float = 1.0, **options: Any
-    ) -> SpaceTimeSDF:
-        """Untrained levels; the arguments are those of `MultiscaleSDF.from_widths`.
-
-        ``time_gain`` is a factor on the initial weights of t; below 1 the field starts slower in time than in space.
-        """
-        sdf = MultiscaleSDF.from_widths(sizes, omegas=omegas, in_dim=4, **options)
-        with torch.no_grad():
-            for level in sdf.levels:
-                assert isinstance(level, Siren)
-                level.layers[0].weight[:, 3] *= time_gain  # pyright: ignore[reportIndexIssue]
-        return cls(sdf)
+    def from_widths(cls, sizes: Sequence[tuple[int, int]], *, omegas: Sequence[float], **options: Any) -> SpaceTimeSDF:
+        """Untrained levels; the arguments are those of `MultiscaleSDF.from_widths`."""
+        return cls(MultiscaleSDF.from_widths(sizes, omegas=omegas, in_dim=4, **options))
 
     @classmethod
-    def from_static(cls, field: Field, *, extra_width: int = 0, time_gain: float = 1.0) -> SpaceTimeSDF:
+    def from_static(cls, field: Field) -> SpaceTimeSDF:
         """A field of space-time that equals a static one at all times, ready to be trained.
 
-        The weights are copied, and those of t start at zero. The neurons of ``extra_width`` start with random weights,
-        but the rows from them to the copied neurons and to the output start at zero.
-
-        Args:
-            field: a three-dimensional `Siren` or a `MultiscaleSDF` of them; not changed.
-            extra_width: neurons added to every sine layer of every level.
-            time_gain: factor on the initial weights of t of the added neurons.
-
-        Raises:
-            ValueError: a field of another kind, or ``extra_width`` is negative.
+        ``field`` is a three-dimensional `Siren` or a `MultiscaleSDF` of them; ValueError for another kind. Its weights
+        are copied, and those of t start at zero.
         """
         field = solid(field)
-        at_least(0, extra_width=extra_width)
         taper = field.taper if isinstance(field, MultiscaleSDF) else 0.0
         lifted: list[Field] = []
         for level in levels_of(field):
             if not isinstance(level, Siren):
                 raise ValueError(f"a level of the field is a {type(level).__name__}; expected a Siren")
-            lifted.append(_lift(level, extra_width, time_gain))
+            lifted.append(_lift(level))
         return cls(_assembled(lifted, field.deltas, taper).to(field.like))
 
     def with_level(self, residual: Field, *, delta: float) -> SpaceTimeSDF:
@@ -169,7 +149,7 @@ class TimeSlice(Wrapper):
         self.in_dim, self.num_levels = 3, field.num_levels
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        """See `Field.jet`; the gradient is that by space (see `time_derivative`)."""
+        """See `Field.jet`; the gradient is that by space (see `spacetime_jet`)."""
         value, gradient, features = self.field.jet(self._home(x), level=level)
         return Jet(value, gradient[..., :3], features)
 
@@ -178,10 +158,6 @@ class TimeSlice(Wrapper):
         dims = self.resolve_dims(dims)
         value, gradient, features, hessian = self.field.second_jet(self._home(x), level=level, dims=dims)
         return SecondJet(value, gradient[..., :3], features, hessian)
-
-    def time_derivative(self, x: Tensor, *, level: int = -1) -> Tensor:
-        """∂f/∂t at ``x`` ``(..., 3)`` → ``(...,)``."""
-        return self.field.jet(self._home(x), level=level).gradient[..., 3]
 
     def spacetime_jet(self, x: Tensor, *, level: int = -1, order: int = 1) -> SpaceTimeJet:
         """Value and all derivatives at ``x`` ``(..., 3)``; see `spacetime_jet`."""
@@ -219,19 +195,12 @@ def _slice(field: Field, t: float) -> Field:
 
 
 @torch.no_grad()
-def _lift(siren: Siren, extra: int, time_gain: float) -> Siren:
-    """The same function of (x, y, z, t), with neurons of no effect added to its layers."""
-    siren, width = copy.deepcopy(siren), siren.width
+def _lift(siren: Siren) -> Siren:
+    """The same function of (x, y, z, t)."""
+    siren = copy.deepcopy(siren).requires_grad_(True)
     siren.set_units()
-    lifted = Siren(width + extra, siren.depth, omega=siren.omega, in_dim=4, num_features=siren.num_features)
-    pairs = zip([*lifted.layers, lifted.output], [*siren.layers, siren.output], strict=True)
-    for index, (new, old) in enumerate(pairs):
-        assert isinstance(new, nn.Linear)
-        assert isinstance(old, nn.Linear)
-        known = len(old.weight)
-        if index == 0:
-            new.weight[:, 3] *= time_gain
-        new.weight[:known] = 0
-        new.weight[:known, : old.in_features] = old.weight
-        new.bias[:known] = old.bias
-    return lifted
+    first = siren.layers[0]
+    assert isinstance(first, nn.Linear)
+    first.weight = nn.Parameter(nn.functional.pad(first.weight, (0, 1)))
+    first.in_features = siren.in_dim = 4
+    return siren

@@ -187,33 +187,6 @@ def trajectories(
     return torch.stack(path)
 
 
-def transport_error(
-    field: Field,
-    initial: Field,
-    velocity: VectorField,
-    points: Tensor,
-    times: Sequence[float] | Tensor,
-    *,
-    solver: Solver | None = None,
-) -> Tensor:
-    """``|f(x(t), t) − f_0(x_0)|`` along characteristics, ``(T, N)``: how far f is from being f_0 carried by V.
-
-    On points x_0 of the surface of f_0 it measures the surface, all that matters to a law with ``extend=True``; on any
-    points the solution of ∂f/∂t + ⟨∇f, V⟩ = 0.
-
-    Args:
-        field: f, four-dimensional.
-        initial: f_0, three-dimensional, the shape at ``times[0]``.
-        velocity: V.
-        points: x_0, ``(N, 3)``.
-        times: the moments, ``(T,)``.
-        solver: as in `flow`.
-    """
-    path = trajectories(velocity, points, times, solver=solver)
-    moments = _moments(times, points)
-    return (field.value(at_time(path, moments[:, None])) - initial.value(points)).abs()
-
-
 def track(
     field: Field,
     points: Tensor,

@@ -135,5 +135,4 @@ def learn_start(
         siren = Siren(config.widths[0], config.depths[0], omega=config.omegas[0]).to(known.points)
     objective = _StillObjective(siren, known, config, generator)
     Trainer(objective, stage="first shape", steps=config.start_steps, seconds=seconds).run(report=progress)
-    with seeded(config.seed):
-        return SpaceTimeSDF.from_static(siren)
+    return SpaceTimeSDF.from_static(siren)

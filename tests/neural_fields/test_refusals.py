@@ -78,7 +78,6 @@ REFUSED: list[tuple[Callable[[], object], str]] = [
     (lambda: nf.TextureField(BALL, ColorSiren(4, 1), delta=0.1, outside=(0, 0, 2)), "outside="),
     (lambda: nf.TextureField(BALL, ColorSiren(4, 1), delta=0.1, geometry_level=3), "level=3"),
     (lambda: TEXTURE.colors(torch.zeros(5, 4)), "x has shape"),
-    (lambda: TEXTURE.derivative_along(ROWS, POINTS), "direction has shape"),
     (lambda: TEXTURE.value(ROWS, level=1), "level=1"),
     # What moves
     (lambda: nf.SpaceTimeSDF(small_multiscale()), "in_dim=3"),
@@ -86,7 +85,6 @@ REFUSED: list[tuple[Callable[[], object], str]] = [
     (lambda: nf.TimeSlice(small_spacetime(), torch.rand(2)), r"t has shape \(2,\)"),
     (lambda: nf.SpaceTimeSDF.from_static(BALL), "a level of the field is a Sphere"),
     (lambda: nf.SpaceTimeSDF.from_static(small_spacetime()), "in_dim=4"),
-    (lambda: nf.SpaceTimeSDF.from_static(small_multiscale(), extra_width=-1), "extra_width=-1"),
     (lambda: spacetime_jet(small_spacetime(), torch.rand(2, 4), order=3), "order=3"),
     (lambda: Keyframes([0.0, 0.0], [BALL, BALL]), r"times=\[0.0, 0.0\]"),
     (lambda: Keyframes([0.0], []), "1 times for 0 fields"),

@@ -70,7 +70,7 @@ def test_sphere_points_normals_and_colours():
     assert angles[facing > 0.35].max() < 1  # seen at less than 70 degrees from the normal
     assert angles.max() < 20  # at the rim, where the neighbours on one side are missing
     assert ((cloud.normals * cloud.points).sum(axis=1) < 0).all()
-    pixels, _ = lens.project(cloud.points)
+    pixels = lens.at(np.eye(4)).in_view(cloud.points)[0]
     assert np.abs(cloud.colors[:, :2] * 255 - pixels).max() < 1e-4
     assert report.without_reading == int(np.isnan(depth).sum())
     assert report.pixels == report.without_reading + report.edges + report.grazing + report.specks + report.kept
@@ -121,7 +121,7 @@ def test_noise_is_measured_and_smoothed_away_but_not_over_the_edge():
     assert off.mean() < 0.4 * 0.002 * 2
     assert np.median(degrees_between(raw.normals, -normal[None])) > 20
     assert np.median(degrees_between(cloud.normals[left], -normal[None])) < 6
-    u, v = np.rint(lens.project(cloud.points)[0]).astype(int).T
+    u, v = np.rint(lens.at(np.eye(4)).in_view(cloud.points)[0]).astype(int).T
     assert np.abs(cloud.points[:, 2] - depth[v, u]).max() < 0.05
 
 
@@ -157,7 +157,7 @@ def test_colours_guide_the_smoothing():
 
     def step(picture):
         cloud, _ = frame_cloud(RgbdFrame(noisy, LENS, picture), DepthSettings(smoothing=6))
-        pixels = np.rint(LENS.project(cloud.points)[0][:, 0])
+        pixels = np.rint(LENS.at(np.eye(4)).in_view(cloud.points)[0][:, 0])
         return cloud.points[pixels == 48, 2].mean() - cloud.points[pixels == 47, 2].mean()
 
     assert step(color) == pytest.approx(0.004, abs=0.0008)
@@ -375,7 +375,7 @@ def test_fit_of_several_posed_depth_maps(scene, tmp_path, capsys, monkeypatch):
 
 
 def test_depth_maps_whose_pose_is_lost_are_left_out_and_counted(scene, tmp_path):
-    poses = datasets.read_trajectory(scene / "trajectory.log")
+    poses = [pose for _, pose, _ in datasets.read_poses(scene / "trajectory.log")]
     for name, pose in zip(("000", "001", "002"), (poses[0], poses[1] - np.inf, poses[2]), strict=True):
         np.savetxt(tmp_path / f"{name}.txt", pose)
     source = DepthInput(scene / "depth", (str(scene / "camera.json"),), color=scene / "color", poses=tmp_path)

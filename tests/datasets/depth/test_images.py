@@ -5,7 +5,6 @@ import json
 import cv2
 import numpy as np
 import pytest
-from mplicits import datasets
 from mplicits.datasets import DepthCamera, is_depth_file, look_at, read_color, read_depth, read_intrinsics, read_poses
 from mplicits.datasets.depth.images import fit_color
 from refusals import refused
@@ -243,10 +242,13 @@ def test_lenses_from_an_angle_or_a_camera():
 def test_distortion_is_undone_and_is_that_of_opencv():
     depth = np.random.default_rng(3).uniform(1, 3, (120, 160))
     points = LENS.unproject(depth).reshape(-1, 3)
-    pixels, inside = LENS.project(points)
+    camera = LENS.at(np.eye(4))
+    pixels, _, inside = camera.in_view(points)
     assert inside.all()
     assert np.abs(pixels.reshape(120, 160, 2) - np.dstack(np.meshgrid(np.arange(160), np.arange(120)))).max() < 1e-8
-    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), LENS.matrix, np.array(LENS.distortion))
+    theirs, _ = cv2.projectPoints(
+        points, np.zeros(3), np.zeros(3), camera.intrinsics.numpy(), np.array(LENS.distortion)
+    )
     assert np.abs(pixels - theirs[:, 0]).max() < 1e-8
     straight = DepthCamera(160, 120, LENS.fx, LENS.fy, LENS.cx, LENS.cy).unproject(depth).reshape(-1, 3)
     assert np.abs(points - straight).max() > 0.05  # so that the test would notice a lens left out
@@ -320,7 +322,7 @@ def frame(pose):
 )
 def test_lost_frames_have_no_pose(tmp_path, files):
     paths = [write(tmp_path / name, content) for name, content in files.items()]
-    lost, found = datasets.read_trajectory(paths[0] if len(paths) == 1 else paths[0].parent)
+    (_, lost, _), (_, found, _) = read_poses(paths[0] if len(paths) == 1 else paths[0].parent)
     assert np.isnan(lost).all()
     assert np.abs(found - POSE).max() < 1e-8
 
@@ -340,7 +342,7 @@ def test_lost_frames_have_no_pose(tmp_path, files):
 def test_bad_trajectories(tmp_path, text, message):
     path = write(tmp_path / "trajectory.log", text)
     with refused(path, message):
-        datasets.read_trajectory(path)
+        read_poses(path)
 
 
 def test_poses_with_names_and_lenses(tmp_path):

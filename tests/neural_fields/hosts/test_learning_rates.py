@@ -117,7 +117,7 @@ def test_lifted_into_space_time_and_sliced_it_stays_the_same() -> None:
     fields = []
     for field in (plain, shared):
         torch.manual_seed(3)
-        fields.append(SpaceTimeSDF.from_static(field, extra_width=4))
+        fields.append(SpaceTimeSDF.from_static(field))
     x = torch.rand(40, 4) - 0.5
     assert torch.equal(fields[0].value(x), fields[1].value(x))
     for siren in fields[1].sdf.levels:
