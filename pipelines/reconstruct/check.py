@@ -225,8 +225,8 @@ def check_cameras(images: PosedImages) -> CameraCheck:
     cameras = [view.camera.moved(images.similarity) for view in images.views]
     eyes, forward = _eyes_and_axes(cameras)
     sphere = fibonacci_directions(2000)
-    in_view = np.array([_inside_image(camera, sphere).mean() for camera in cameras])
-    middle = np.array([_inside_image(camera, np.zeros((1, 3)))[0] for camera in cameras])
+    in_view = np.array([camera.in_view(sphere)[2].mean() for camera in cameras])
+    middle = np.array([camera.in_view(np.zeros((1, 3)))[2][0] for camera in cameras])
     points = None if images.points is None else images.similarity.to_unit(images.points)
     mask_inside = _mask_inside(images.views, cameras)
     warnings = list(_placement(eyes, forward, middle))
@@ -286,13 +286,6 @@ def _field_of_view(camera: Camera) -> tuple[float, float]:
     ]
     across, down = (float(np.degrees(np.arctan(low / focal) + np.arctan(high / focal))) for low, high, focal in sides)
     return across, down
-
-
-def _inside_image(camera: Camera, points: Float64) -> Bool:
-    """Whether points ``(N, 3)`` fall into the image ``(N,)``; what hides behind what is not asked."""
-    pixels, z = camera.project(torch.from_numpy(points))
-    corner = pixels.new_tensor([camera.width, camera.height]) - 0.5
-    return ((z > 0) & ((pixels >= -0.5) & (pixels <= corner)).all(dim=1)).numpy()
 
 
 def _placement(eyes: Float64, forward: Float64, middle: Bool) -> Iterator[str]:

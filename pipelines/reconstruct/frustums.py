@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,7 +16,6 @@ from ...neural_fields.meshing.extract import Mesh
 from ..render.shade import COLOR_MAPS, apply_color_map
 
 Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 Rgb = tuple[float, float, float]
 
 
@@ -39,12 +37,6 @@ class Style:
 STYLE = Style()
 
 
-class _Part(NamedTuple):
-    vertices: Float64  # (V, 3)
-    faces: Int64  # (F, 3)
-    colors: Float64  # (V, 3)
-
-
 def camera_mesh(images: PosedImages) -> Mesh:
     """Frustums, the unit sphere around the region of interest, the axes of the world and sparse points, as one mesh.
 
@@ -55,7 +47,9 @@ def camera_mesh(images: PosedImages) -> Mesh:
     size, reach = frustum_size(cameras)
     order = torch.linspace(0, 1, len(cameras), dtype=torch.float64)
     colors = apply_color_map(order, (0, 1), COLOR_MAPS["viridis"]).numpy()
-    parts, tube = [_wire_sphere(), _axes()], STYLE.tube * size
+    parts, tube = [_wire_sphere()], STYLE.tube * size
+    for end, color in zip(STYLE.axis * np.eye(3), STYLE.axes, strict=True):
+        parts.append(_tubes(np.stack((np.zeros(3), end))[None], 3 * STYLE.wire, color))
     for view, camera, color in zip(images.views, cameras, colors, strict=True):
         corners = _plane(camera, size, reach)
         parts += [_frame(camera.eye.numpy(), corners, color, tube), _picture(corners, view.color, tube)]
@@ -83,7 +77,7 @@ def _plane(camera: Camera, size: float, reach: float) -> Float64:
     return camera.eye.numpy() + depth * rays @ camera.world_from_camera[:3, :3].numpy().T
 
 
-def _frame(eye: Float64, corners: Float64, color: Float64, radius: float) -> _Part:
+def _frame(eye: Float64, corners: Float64, color: Float64, radius: float) -> Mesh:
     """Lines from the eye to the corners, the rim of the picture, and a triangle on its upper edge."""
     left, right, _, lower = corners
     apex = (left + right) / 2 + 0.25 * (left - lower)
@@ -93,7 +87,7 @@ def _frame(eye: Float64, corners: Float64, color: Float64, radius: float) -> _Pa
     return _tubes(np.concatenate((rays, rim, roof)), radius, color)
 
 
-def _picture(corners: Float64, color: NDArray[np.float32], gap: float) -> _Part:
+def _picture(corners: Float64, color: NDArray[np.float32], gap: float) -> Mesh:
     """The image plane, seen from both sides (``gap`` apart), with the picture as colours of a grid of vertices."""
     height, width = color.shape[:2]
     share = min(1.0, STYLE.thumbnail / max(height, width))
@@ -110,10 +104,10 @@ def _picture(corners: Float64, color: NDArray[np.float32], gap: float) -> _Part:
     # Each side has its own sheet, or the two would flicker where a viewer draws back faces.
     sheets = np.stack((grid + gap * forward / np.linalg.norm(forward), grid)).reshape(-1, 3)
     colors = np.tile(small.reshape(-1, 3).astype(np.float64), (2, 1))
-    return _Part(sheets, np.concatenate((faces, faces[:, ::-1] + number.size)), colors)
+    return Mesh(sheets, np.concatenate((faces, faces[:, ::-1] + number.size)), colors=colors)
 
 
-def _wire_sphere(*, meridians: int = 6, parallels: int = 5, sides: int = 64) -> _Part:
+def _wire_sphere(*, meridians: int = 6, parallels: int = 5, sides: int = 64) -> Mesh:
     """The unit sphere as circles through and around the z axis."""
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     ring = np.stack((np.cos(angle), np.sin(angle)), axis=1)
@@ -125,17 +119,7 @@ def _wire_sphere(*, meridians: int = 6, parallels: int = 5, sides: int = 64) -> 
     return _tubes(np.stack((circles[:, :-1], circles[:, 1:]), axis=2).reshape(-1, 2, 3), STYLE.wire, STYLE.grey)
 
 
-def _axes() -> _Part:
-    ends = STYLE.axis * np.eye(3)
-    return _joined_parts(
-        [
-            _tubes(np.stack((np.zeros(3), end))[None], 3 * STYLE.wire, color)
-            for end, color in zip(ends, STYLE.axes, strict=True)
-        ]
-    )
-
-
-def _tubes(segments: Float64, radius: float, color: Rgb | Float64) -> _Part:
+def _tubes(segments: Float64, radius: float, color: Rgb | Float64) -> Mesh:
     """Three-sided tubes along segments ``(S, 2, 3)``, closed at both ends."""
     along = segments[:, 1] - segments[:, 0]
     along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
@@ -150,31 +134,25 @@ def _tubes(segments: Float64, radius: float, color: Rgb | Float64) -> _Part:
     return _copies(vertices.reshape(-1, 6, 3), [*walls, (2, 1, 0), (3, 4, 5)], color)
 
 
-def _octahedra(points: Float64, radius: float, color: Rgb) -> _Part:
+def _octahedra(points: Float64, radius: float, color: Rgb) -> Mesh:
     tips = radius * np.concatenate((np.eye(3), -np.eye(3)))
     upper = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2)]
     lower = [(1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
     return _copies(points[:, None] + tips, upper + lower, color)
 
 
-def _copies(vertices: Float64, faces: Sequence[tuple[int, int, int]], color: Rgb | Float64) -> _Part:
-    """One part of N alike: vertices ``(N, K, 3)``, and the faces of each."""
+def _copies(vertices: Float64, faces: Sequence[tuple[int, int, int]], color: Rgb | Float64) -> Mesh:
+    """One mesh of N alike: vertices ``(N, K, 3)``, and the faces of each."""
     count, corners, _ = vertices.shape
     numbers = np.array(faces)[None] + corners * np.arange(count)[:, None, None]
     colors = np.broadcast_to(np.asarray(color, np.float64), (count * corners, 3))
-    return _Part(vertices.reshape(-1, 3), numbers.reshape(-1, 3), colors)
+    return Mesh(vertices.reshape(-1, 3), numbers.reshape(-1, 3), colors=colors)
 
 
-def _joined_parts(parts: Sequence[_Part]) -> _Part:
+def _joined(parts: Sequence[Mesh]) -> Mesh:
     starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
-    return _Part(
+    return Mesh(
         np.concatenate([part.vertices for part in parts]),
-        np.concatenate(faces),
-        np.concatenate([part.colors for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]).astype(np.int32),
+        colors=np.concatenate([part.colors for part in parts if part.colors is not None]).astype(np.float32),
     )
-
-
-def _joined(parts: Sequence[_Part]) -> Mesh:
-    part = _joined_parts(parts)
-    return Mesh(part.vertices, part.faces.astype(np.int32), None, part.colors.astype(np.float32))
