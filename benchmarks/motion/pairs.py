@@ -19,11 +19,12 @@ import numpy as np
 import torch
 from mplicits.datasets.cameras import Camera
 from mplicits.neural_fields import Field, InputError, Mesh, TimeSlice
+from mplicits.neural_fields.meshing.extract import surface_of
 from mplicits.neural_fields.spacetime.evolution import VectorField
 from mplicits.pipelines.evolve.checks import volume
 from mplicits.pipelines.evolve.problem import build_problem
 from mplicits.pipelines.evolve.shapes import read_shape
-from mplicits.pipelines.evolve.topology import surface_of, topology_of
+from mplicits.pipelines.evolve.topology import topology_of
 from mplicits.pipelines.evolve.train import train_evolution
 from mplicits.pipelines.render.draw import Orbit, orbit_cameras
 from mplicits.pipelines.render.picture import contact_sheet, in_rows, write_picture

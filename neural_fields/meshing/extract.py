@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import normalize
 
-from ..backend.errors import positive
+from ..backend.errors import InputError, positive
 from ..fields.field import FieldLike, as_field, solid
 from ._cells import (
     EDGE_AXIS,
@@ -115,6 +117,23 @@ def extract_mesh(
     seconds = {stage: after - before for stage, before, after in zip(stages, times, times[1:], strict=False)}
     stats = MeshStats(tuple(sampler.counts), int(kept.sum()), len(cells.cases), seconds)
     return Mesh(vertices, faces, unit, stats=stats)
+
+
+def surface_of(field: FieldLike, *, resolution: int, level: int = -1) -> Mesh | None:
+    """`extract_mesh` without normals; None without a surface."""
+    try:
+        return extract_mesh(field, resolution=resolution, level=level, normals=False)
+    except NoSurfaceError:
+        return None
+
+
+@contextmanager
+def surface_needed(complaint: str) -> Iterator[None]:
+    """Inside, a missing surface is an InputError that begins with the ``complaint``."""
+    try:
+        yield
+    except NoSurfaceError as error:
+        raise InputError(f"{complaint} ({error})") from error
 
 
 @torch.no_grad()

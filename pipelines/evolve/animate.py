@@ -18,7 +18,7 @@ from ...neural_fields import Field, InputError, Similarity, load_field
 from ...neural_fields.backend.devices import choose_device
 from ...neural_fields.backend.files import check_place
 from ...neural_fields.fields.similarity import Placement
-from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh, surface_of
 from ...neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
 from ..mesh.files import write_mesh, write_moving
 from ..render.draw import Orbit, orbit_cameras, traced_part
@@ -225,15 +225,12 @@ def _tracer(field: Field, camera: Camera, level: int) -> DynamicTracer:
 
 def _outline(moving: MovingSurface) -> NDArray[np.float64]:
     """Points that the camera has to have in view at all times."""
-    seen = []
-    for time in np.linspace(0, 1, min(9, moving.options.frames)).tolist():
-        try:
-            seen.append(extract_mesh(moment(moving.field, time), resolution=48, normals=False).vertices)
-        except NoSurfaceError:
-            continue  # a surface may come and go
-    if not seen:
+    times = np.linspace(0, 1, min(9, moving.options.frames)).tolist()
+    seen = [surface_of(moment(moving.field, time), resolution=48) for time in times]
+    points = [mesh.vertices for mesh in seen if mesh is not None]  # a surface may come and go
+    if not points:
         raise InputError(f"{moving.file}: no surface at any time")
-    return traced_part(np.concatenate(seen))
+    return traced_part(np.concatenate(points))
 
 
 def _write_series(folder: Path, moving: MovingSurface) -> str:

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...neural_fields import Field, NoSurfaceError, Similarity, TimeSlice, extract_mesh
+from ...neural_fields import Field, Similarity, TimeSlice
+from ...neural_fields.meshing.extract import surface_of
 from ..fit.samples import value_and_gradient
 from ..surface.measure import chamfer
 from ..surface.surface import sample_points, volume
 from .problem import End
 from .samples import band_points
-from .topology import Change, Topology, find_changes, surface_of, topology_of
+from .topology import Change, Topology, find_changes, topology_of
 
 END_RESOLUTION = 192
 
@@ -88,9 +89,8 @@ def end_figures(field: Field, end: End) -> dict[str, Any]:
         "chamfer": None,
         "floor": sum(chamfer(*(points.double().numpy() for points in (end.points, end.others)))),
     }
-    try:
-        mesh = extract_mesh(at, resolution=END_RESOLUTION, normals=False)
-    except NoSurfaceError:
+    mesh = surface_of(at, resolution=END_RESOLUTION)
+    if mesh is None:
         return figures | {"ratio": None}
     found, _ = sample_points(mesh, len(end.points), np.random.default_rng(0))
     figures["chamfer"] = sum(chamfer(found, end.others.double().numpy()))

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Field, InputError, flow, project_to_surface
-from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.extract import extract_mesh, surface_needed, surface_of
 from ...neural_fields.spacetime.dynamic_tracing import moment
 from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
-from .topology import surface_of, topology_of
+from .topology import topology_of
 
 # Cells on a side that pieces and holes of a surface are counted on; those that slip through do not count.
 TOPOLOGY_RESOLUTION = 64
@@ -53,10 +53,8 @@ def follow_mesh(
         InputError: there is no surface at the start, or it cannot be followed; says to which time.
     """
     start = moment(field, times[0])
-    try:
+    with surface_needed(f"{name}: no surface at time {times[0]:.3g}"):
         mesh = extract_mesh(start, resolution=resolution, level=level)
-    except NoSurfaceError as error:
-        raise InputError(f"{name}: no surface at time {times[0]:.3g} ({error})") from error
     shape = topology_of(surface_of(start, resolution=TOPOLOGY_RESOLUTION, level=level))
     # The mesher's vertices are on the edges of its lattice, and as near to the surface as one step along them brings.
     points = project_to_surface(start, torch.from_numpy(mesh.vertices).to(field.like), level=level)[0]

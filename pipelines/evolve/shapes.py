@@ -23,7 +23,6 @@ from ...neural_fields import (
     InputError,
     Jet,
     Mesh,
-    NoSurfaceError,
     Similarity,
     Sphere,
     Torus,
@@ -32,6 +31,7 @@ from ...neural_fields import (
     project_to_surface,
 )
 from ...neural_fields.fields.csg import Bounded
+from ...neural_fields.meshing.extract import surface_needed
 from ..surface.surface import sample_points
 from ..training.folder import find_field
 
@@ -226,10 +226,8 @@ def _numbers(text: str, numbers: str, count: int) -> Float64:
 
 
 def _meshed(name: str, field: Field, similarity: Similarity) -> StaticShape:
-    try:
+    with surface_needed(f"{name}: has no surface in the unit sphere"):
         mesh = extract_mesh(field, resolution=128, normals=False)
-    except NoSurfaceError as error:
-        raise InputError(f"{name}: has no surface in the unit sphere ({error})") from error
     return StaticShape(name, field, similarity, mesh)
 
 

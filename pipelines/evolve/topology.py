@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import Field, Mesh, NoSurfaceError, TimeSlice, at_time, extract_mesh
-from ...neural_fields.fields.field import FieldLike
+from ...neural_fields import Field, Mesh, TimeSlice, at_time
+from ...neural_fields.meshing.extract import surface_of
 from ..surface.surface import components
 
 
@@ -66,14 +66,6 @@ def topology_of(surface: Mesh | None) -> Topology:
     edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     euler, pieces = len(np.unique(faces)) - len(edges) + len(faces), components(surface)
     return Topology(pieces, pieces - euler // 2)
-
-
-def surface_of(field: FieldLike, *, resolution: int, level: int = -1) -> Mesh | None:
-    """The mesh of a static field, or of a function of points; None without a surface."""
-    try:
-        return extract_mesh(field, resolution=resolution, level=level, normals=False)
-    except NoSurfaceError:
-        return None
 
 
 def find_changes(

@@ -19,7 +19,7 @@ from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import vertex_normals
 from ...neural_fields import Field, InputError, Mesh
 from ...neural_fields.backend.devices import upload
-from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh, map_normals
+from ...neural_fields.meshing.extract import extract_mesh, map_normals, surface_needed
 from ...neural_fields.tracing.sphere import map_attribute
 from ..surface.surface import Support, in_region, keep_largest, read_support, trim_distance, visible_part, without_blobs
 from ..texture.transport import Colors, colors_of_run
@@ -183,10 +183,8 @@ def export_run(
         cloud = read_cloud(source, columns=columns)
         points = similarity.to_unit(cloud.points[np.isfinite(cloud.points).all(axis=1)])
     resolution = _resolution(field, options.resolution, support, level, say)
-    try:
+    with surface_needed(f"{file}: no surface to mesh"):
         mesh = extract_mesh(field, resolution=resolution, level=level)
-    except NoSurfaceError as error:
-        raise InputError(f"{file}: no surface to mesh ({error})") from error
     if "region" in metadata.get("run", {}):
         mesh = in_region(mesh)
         if mesh is None:

@@ -28,7 +28,7 @@ from ...neural_fields import (
 )
 from ...neural_fields.fields.csg import Bounded
 from ...neural_fields.fields.similarity import METRES
-from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.extract import extract_mesh, surface_needed
 from ...neural_fields.shape import in_one_frame
 from ..surface.distance import MeshField
 from ..surface.surface import Support, is_closed, read_support, read_surface, volume, without_blobs
@@ -230,11 +230,9 @@ def _extracted(field: Field, options: SolidOptions, what: str, level: int | None
     """The mesh of a level, in the coordinates of the field."""
     level = options.level if level is None else level
     level = field.num_levels - 1 if level is None else min(level, field.num_levels - 1)
-    try:
-        box = ((-HALF_BOX, -HALF_BOX, -HALF_BOX), (HALF_BOX, HALF_BOX, HALF_BOX))
+    box = ((-HALF_BOX, -HALF_BOX, -HALF_BOX), (HALF_BOX, HALF_BOX, HALF_BOX))
+    with surface_needed(f"{what}: nothing is left"):
         return extract_mesh(field, resolution=options.resolution, level=level, bounds=box)
-    except NoSurfaceError as error:
-        raise InputError(f"{what}: nothing is left ({error})") from error
 
 
 def _supported(

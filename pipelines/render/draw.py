@@ -20,7 +20,7 @@ from ...datasets.textured.mesh import TexturedMesh
 from ...datasets.views.images import read_cameras
 from ...neural_fields import Field, InputError, Similarity, WorldField
 from ...neural_fields.backend.devices import choose_device
-from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.extract import extract_mesh, surface_needed
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 from ..fit.cloud import CloudDistance
 from ..surface.surface import read_surface, sample_points
@@ -133,11 +133,8 @@ def _panel(level: int, normal_level: int) -> Panel:
 
 def _outline(file: Path, field: Field) -> Float64:
     """Points of the finest level, whichever is drawn, so that one camera serves all levels and a mesh of them."""
-    try:
-        vertices = extract_mesh(field, resolution=FRAME_RESOLUTION).vertices.astype(np.float64)
-    except NoSurfaceError as error:
-        raise InputError(f"{file}: no surface to render ({error})") from error
-    return traced_part(vertices)
+    with surface_needed(f"{file}: no surface to render"):
+        return traced_part(extract_mesh(field, resolution=FRAME_RESOLUTION).vertices)
 
 
 def traced_part(points: Float64) -> Float64:

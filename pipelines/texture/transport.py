@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ...neural_fields import Field, InputError, Similarity, TextureField, extract_mesh, flow, load_field, map_colors
-from ...neural_fields.meshing.extract import NoSurfaceError
+from ...neural_fields import Field, InputError, Similarity, TextureField, flow, load_field, map_colors
+from ...neural_fields.meshing.extract import surface_of
 from ...neural_fields.spacetime.dynamic_tracing import moment
 from ...neural_fields.spacetime.evolution import VectorField
 from ...neural_fields.spacetime.flow import IntegrationError, Solver
@@ -104,9 +104,8 @@ def _texture_at(
     texture = texture_of(find_field(run), geometry) if geometry.in_dim == 3 else None
     if texture is None:
         raise InputError(f"{flag} {run}: has no texture; make one with `mplicits texture {run} COLORS`")
-    try:
-        mesh = extract_mesh(moment(field, time), resolution=TRANSPORT.checked, normals=False)
-    except NoSurfaceError:
+    mesh = surface_of(moment(field, time), resolution=TRANSPORT.checked)
+    if mesh is None:
         return texture  # there is nothing to be coloured
     points = own(torch.from_numpy(mesh.vertices).to(field.like))
     points = points[points.norm(dim=-1) < 1]  # what the texture's fit says elsewhere is no surface of anything
@@ -144,10 +143,8 @@ class TransportedPoints:
                 ]
                 or [points]
             )
-        try:
-            still = moment(self._field, time)
-            mesh = extract_mesh(still, resolution=TRANSPORT.carried, level=self._level, normals=False)
-        except NoSurfaceError:
+        mesh = surface_of(moment(self._field, time), resolution=TRANSPORT.carried, level=self._level)
+        if mesh is None:
             return lambda points: points  # there is nothing that could have come from anywhere
         vertices = torch.from_numpy(mesh.vertices).to(self._field.like)
         try:
@@ -223,9 +220,8 @@ class _Pinned:
     @cached_property
     def _spread(self) -> SpreadColors | None:
         """None without a surface."""
-        try:
-            mesh = extract_mesh(self._still, resolution=TRANSPORT.spread, level=self._level, normals=False)
-        except NoSurfaceError:
+        mesh = surface_of(self._still, resolution=TRANSPORT.spread, level=self._level)
+        if mesh is None:
             return None
         points = project_to_surface(self._still, torch.from_numpy(mesh.vertices).to(self._still.like))[0]
         return SpreadColors(points, self.colors(points))

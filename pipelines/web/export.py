@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...datasets.cameras import turntable
 from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, TextureField, extract_mesh, load_field
 from ...neural_fields.backend.files import write_whole
-from ...neural_fields.meshing.extract import NoSurfaceError
+from ...neural_fields.meshing.extract import NoSurfaceError, surface_needed
 from ...neural_fields.spacetime.field import SpaceTimeSDF
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 from ..render.draw import FRAME_RESOLUTION, traced_part
@@ -131,10 +131,8 @@ def pack(source: str | Path, options: WebOptions | None = None) -> Packed:
     if cloud is not None and field.in_dim != 3:
         raise InputError(f"--cloud: {file} moves; add --time T, or leave it out")
     name = file.resolve().parent.name if file.name == "field.safetensors" else file.stem
-    try:
+    with surface_needed(f"{file}: no surface to show"):
         return pack_field(field, similarity, options, name=name, texture=texture, cloud=cloud)
-    except NoSurfaceError as error:
-        raise InputError(f"{file}: no surface to show ({error})") from error
 
 
 def pack_field(

@@ -5,10 +5,11 @@ import dataclasses
 import pytest
 import torch
 from mplicits.neural_fields import FunctionField, Similarity, TimeSlice
+from mplicits.neural_fields.meshing.extract import surface_of
 from mplicits.pipelines.evolve import topology
 from mplicits.pipelines.evolve.checks import check_evolution, warnings
 from mplicits.pipelines.evolve.problem import End
-from mplicits.pipelines.evolve.topology import CHANGES, Topology, find_changes, surface_of, topology_of
+from mplicits.pipelines.evolve.topology import CHANGES, Topology, find_changes, topology_of
 from torch import Tensor
 
 RESOLUTION = 32
