@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from ..render.rasterise import picture_of
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import trace_view
 from ..surface.surface import from_cloud
-from ..training.progress import Progress, Report, format_table, progress_bars, reported
+from ..training.progress import counted, format_table, progress_bars, reported
 from ..training.settings import FitConfig
 from .common import tell_budget
 
@@ -53,7 +53,7 @@ def demo(
     said: list[str] = []  # once the bars are gone
     with progress_bars() as report:
         # Before anything is made.
-        points = statue_scan(progress=_counter(report, "scan")) if cloud is None else read_cloud(cloud)
+        points = statue_scan(progress=counted(report, "scan")) if cloud is None else read_cloud(cloud)
         out.mkdir(parents=True, exist_ok=True)
         file = out / "scan.ply" if cloud is None else Path(cloud)
         if cloud is None:
@@ -70,7 +70,7 @@ def demo(
         run = fit(file, config, out=out / "run", progress=report, level_done=show)
 
         meshes, levels = [], run.field.num_levels
-        mesh_count = _counter(report, "meshes")
+        mesh_count = counted(report, "meshes")
         for level in range(levels):
             mesh_count(level, levels)
             meshes.append(_extract(run.field, level, resolution))
@@ -89,11 +89,6 @@ def demo(
     print("\n".join(said))
     print(f"{out / 'mesh.ply'}, mesh.glb, picture.png, run/: {time.monotonic() - started:.0f} s in all")
     return 0
-
-
-def _counter(report: Report, stage: str) -> Callable[[int, int], None]:
-    """A function that reports how many parts of a stage are done, of how many."""
-    return lambda done, total: report(Progress(stage, done, total, done / total, {}))
 
 
 def _extract(field: Field, level: int, resolution: int) -> Mesh:

@@ -201,8 +201,7 @@ def _slice(arguments: argparse.Namespace) -> int:
     place = given.pop("at", {})
     options = SliceOptions(**given, **place)
 
-    def work(bar: Callable[[int, int], None] | None) -> str:
-        progress = None if bar is None else lambda done: bar(done, options.frames)
+    def work(progress: Callable[[int, int], None] | None) -> str:
         return slice_run(arguments.run, arguments.out, options, progress=progress)
 
     return _draw(arguments.out, "slices" if film else None, work)

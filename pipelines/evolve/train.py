@@ -19,7 +19,7 @@ from ...neural_fields import InputError, MultiscaleSDF, SpaceTimeSDF
 from ..fit.level import LEVEL, new_level
 from ..fit.samples import delta_of
 from ..training.folder import VELOCITY_FILE, RunFolder, digest_of, load_motion
-from ..training.progress import Progress, Report, reported, silent
+from ..training.progress import Report, counted, reported, silent
 from ..training.result import Run
 from ..training.scaffold import BUDGET, Budget, Training
 from ..training.settings import EvolveConfig
@@ -75,9 +75,9 @@ def evolve(
     for path in config.landmarks:
         read_landmarks(path)  # before the shapes, which take their time
     for index, text in enumerate(config.shapes):
-        report(Progress("shapes", index, count, index / count, {}))
+        counted(report, "shapes")(index, count)
         shapes.append(read_shape(text))
-    report(Progress("shapes", count, count, 1.0, {}))
+    counted(report, "shapes")(count, count)
     load_compiler()
     motion = load_motion(folder.path) if resume and folder.path else None
     # A resumed run has the number of samples that its budget allowed in its settings.
@@ -141,9 +141,7 @@ class _Evolving(Training[EvolveConfig, SpaceTimeSDF]):
         frames = self.affordable_frames()
         record = self.record(finished=True)
 
-        def count(done: int, total: int) -> None:
-            self.report(Progress("checks", done, total, done / total, {}))
-
+        count = counted(self.report, "checks")
         count(0, 1)
         left = self.budget.left()
         record["checks"] = check_evolution(

@@ -24,7 +24,7 @@ from ...datasets.views.poses.find_cameras import FoundCameras
 from ...datasets.views.poses.find_points import FoundPoints
 from ...neural_fields import InputError, Similarity
 from ..mesh.files import write_mesh
-from ..training.progress import Progress, Report, silent
+from ..training.progress import Report, counted, silent
 from .frustums import camera_mesh
 from .hull import Agreement, named
 from .measured import UNITS, said_outside
@@ -396,11 +396,7 @@ def _brightness(view: PosedImage) -> float:
 
 def colmap_report(report: Report | None) -> ColmapReport:
     """A receiver of COLMAP's progress that passes it on to ``report``."""
-
-    def passed_on(stage: str, done: int, total: int) -> None:
-        (report or silent)(Progress(stage, done, total, done / max(total, 1), {}))
-
-    return passed_on
+    return lambda stage, done, total: counted(report or silent, stage)(done, total)
 
 
 def said_of(found: FoundCameras | FoundPoints) -> tuple[str, list[str]]:
@@ -410,7 +406,7 @@ def said_of(found: FoundCameras | FoundPoints) -> tuple[str, list[str]]:
         placed = found.photographs - len(found.left_out)
         line = f"{placed} of {found.photographs} photographs placed by {found.points:,} points that are {seen}"
         if found.left_out:
-            names = ", ".join(found.left_out[:3]) + (", …" if len(found.left_out) > 3 else "")
+            names = named(found.left_out)
             warnings.append(f"not placed: {names}; too little in them is in others too, or they are blurred")
     else:
         line = f"{found.points:,} points that {found.photographs} photographs show, {seen}"

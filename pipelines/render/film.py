@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
@@ -22,15 +22,13 @@ ANIMATIONS = (".mp4", ".gif")
 BT709 = ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv"]
 
 
-def write_animation(
-    path: str | Path, frames: Iterable[Image], *, fps: float = 30, progress: Callable[[int], None] | None = None
-) -> None:
+def write_animation(path: str | Path, frames: Iterable[Image], *, fps: float = 30) -> None:
     """Write RGB frames ``(H, W, 3)``, uint8, to an H.264 MP4, or a GIF that loops with one palette for all frames.
 
     Frames are taken one by one, and the file appears when it is complete. An odd width or height of an MP4 is padded by
     repeating the last column or row, since colour is stored at half resolution. A GIF shows at most 50 frames per
-    second. ``progress`` is called with the number of frames so far. Raises an InputError if the file cannot be written,
-    and a ValueError for no frames, frames of several sizes, or ``fps`` ≤ 0.
+    second. Raises an InputError if the file cannot be written, and a ValueError for no frames, frames of several sizes,
+    or ``fps`` ≤ 0.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -38,7 +36,7 @@ def write_animation(
         raise InputError(f"{path}: animations are written as {' or '.join(ANIMATIONS)}")
     if not 0 < fps < float("inf"):
         raise ValueError(f"{path}: fps={fps}; expected a number > 0")
-    checked = _checked(path, frames, progress)
+    checked = _checked(path, frames)
     with whole_file(path) as partial:
         if suffix == ".mp4":
             _write_mp4(partial, checked, fps)
@@ -46,7 +44,7 @@ def write_animation(
             _write_gif(partial, checked, fps)
 
 
-def _checked(path: Path, frames: Iterable[Image], progress: Callable[[int], None] | None) -> Iterator[Image]:
+def _checked(path: Path, frames: Iterable[Image]) -> Iterator[Image]:
     """The frames as they come, or an error that says what is wrong with one."""
     first: tuple[int, ...] | None = None
     count = 0
@@ -60,8 +58,6 @@ def _checked(path: Path, frames: Iterable[Image], progress: Callable[[int], None
                 "draw all of them in one size"
             )
         yield frame
-        if progress is not None:
-            progress(count)
     if not count:
         raise ValueError(f"{path}: no frames to write; expected at least one")
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import Field, InputError, Similarity, load_field
-from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.extract import extract_mesh, surface_needed
 from ..training.folder import chosen_level, find_field
 from .film import ANIMATIONS, write_animation
 from .legend import with_legend
@@ -61,13 +61,13 @@ def slice_run(
     out: str | Path,
     options: SliceOptions | None = None,
     *,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> str:
     """Draw a plane through the field of a run to a picture or film → what was drawn, in a few words.
 
     The plane of a film goes from the middle of the shape to both its ends and back, so that it can be repeated.
-    ``progress`` is called with the number of frames so far. Raises an InputError if there is no such run or level, the
-    plane misses the unit sphere, or the file cannot be written.
+    ``progress`` is called with the number of frames so far, and of all. Raises an InputError if there is no such run or
+    level, the plane misses the unit sphere, or the file cannot be written.
     """
     options, out = options or SliceOptions(), Path(out)
     file = find_field(run)
@@ -82,7 +82,7 @@ def slice_run(
         return f"{view.caption(offset)}, iso-lines every {view.iso_step * similarity.scale:.6g}"
     turn = 2 * np.pi * np.arange(options.frames) / options.frames
     offsets = view.middle + 0.5 * (view.end - view.begin) * np.sin(turn)
-    write_animation(out, _each_once(view.draw, offsets), fps=options.fps, progress=progress)
+    write_animation(out, _each_once(view.draw, offsets, progress), fps=options.fps)
     return f"{options.frames} slices, from {view.caption(view.begin)} to {view.caption(view.end)}"
 
 
@@ -94,10 +94,8 @@ class _View:
         self.normal = np.eye(3)["xyz".index(options.axis)] if options.normal is None else np.array(options.normal)
         self.u, self.v = plane_axes(self.normal, up=options.up)
         self.normal = self.normal / np.linalg.norm(self.normal)
-        try:
-            shape = extract_mesh(field, resolution=64, level=level).vertices.astype(np.float64)
-        except NoSurfaceError as error:
-            raise InputError(f"{file}: no surface to slice ({error})") from error
+        with surface_needed(f"{file}: no surface to slice"):
+            shape = extract_mesh(field, resolution=64, level=level).vertices
         axes = np.stack((self.u, self.v, self.normal), axis=1)
         low, high = (shape @ axes).min(axis=0), (shape @ axes).max(axis=0)  # (3,) right, up, towards the viewer
         self.begin, self.end = float(low[2]), float(high[2])
@@ -165,7 +163,9 @@ class _View:
         )
 
 
-def _each_once(draw: Callable[[float], Image], offsets: Float64) -> Iterator[Image]:
+def _each_once(
+    draw: Callable[[float], Image], offsets: Float64, progress: Callable[[int, int], None] | None
+) -> Iterator[Image]:
     """The picture at each offset; one that comes back is kept, packed, until then instead of drawn again."""
     keys = np.round(offsets, 9).tolist()
     packed: dict[float, NDArray[np.uint8]] = {}
@@ -177,3 +177,5 @@ def _each_once(draw: Callable[[float], Image], offsets: Float64) -> Iterator[Ima
             if key in keys[place + 1 :]:
                 packed[key] = np.asarray(cv2.imencode(".png", image)[1], np.uint8)
             yield image
+        if progress is not None:
+            progress(place + 1, len(keys))

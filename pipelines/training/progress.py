@@ -55,7 +55,8 @@ def progress_bars(*, counting: bool = False, clock: Callable[[], float] = time.m
     if not console.is_terminal:
         yield Lines(counting=counting, clock=clock)
         return
-    with _StagesAndLosses(*_columns(), console=console, transient=counting, get_time=clock) as bars:
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TaskProgressColumn(), _TimeLeft())
+    with _StagesAndLosses(*columns, console=console, transient=counting, get_time=clock) as bars:
         shown = _Bars(bars)
         yield shown
         shown.end()
@@ -127,10 +128,6 @@ class _TimeLeft(ProgressColumn):
         return Text(f"{spent}, about {time_words(rest)} left", style="progress.remaining")
 
 
-def _columns() -> list[ProgressColumn]:
-    return [TextColumn("{task.description}"), BarColumn(bar_width=24), TaskProgressColumn(), _TimeLeft()]
-
-
 class _StagesAndLosses(Bars):
     """Bars with a line of loss terms below, which is too long to stand beside them."""
 
@@ -171,11 +168,16 @@ def _losses(progress: Progress) -> str:
     return "  ".join(f"{name} {value:.1e}" for name, value in progress.losses.items())
 
 
+def counted(report: Report, stage: str) -> Callable[[int, int], None]:
+    """A function that reports how many parts of a stage are done, of how many."""
+    return lambda done, total: report(Progress(stage, done, total, done / max(total, 1), {}))
+
+
 @contextmanager
 def counter_bar(title: str, *, clock: Callable[[], float] = time.monotonic) -> Iterator[Callable[[int, int], None]]:
     """A bar with the time left on stderr, to be told ``(done, total)``; lines now and then where it is no terminal."""
     with progress_bars(counting=True, clock=clock) as report:
-        yield lambda done, total: report(Progress(title, done, total, done / max(total, 1), {}))
+        yield counted(report, title)
 
 
 @contextmanager

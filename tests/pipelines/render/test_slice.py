@@ -294,9 +294,9 @@ def test_an_oblique_plane_and_a_zoom_show_the_place_that_was_named(run):
 
 
 def test_a_film_sweeps_through_the_shape_and_back(run):
-    said = []
-    done = slice_run(run, run / "sweep.gif", SliceOptions(size=(96, 96), frames=8, fps=10), progress=said.append)
-    assert said == list(range(1, 9))
+    said, options = [], SliceOptions(size=(96, 96), frames=8, fps=10)
+    done = slice_run(run, run / "sweep.gif", options, progress=lambda *counts: said.append(counts))
+    assert said == [(count, 8) for count in range(1, 9)]
     assert re.fullmatch(r"8 slices, from z = 16\.2\d\d to z = 25\.8\d\d", done)
     frames = iio.imread(run / "sweep.gif", plugin="pillow", mode="RGB")[:, :96]
     assert len(frames) == 8
