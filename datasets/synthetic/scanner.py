@@ -246,7 +246,7 @@ def _measure(
     exact = position + ranges[..., None] * rays
     hit = np.isfinite(ranges)
     upright, facing = np.zeros_like(rays), np.zeros_like(ranges)
-    upright[hit] = _unit_gradient(field, exact[hit])
+    upright[hit] = unit_rows(jet_at(field, exact[hit])[1])
     facing[hit] = -(upright[hit] * rays[hit]).sum(axis=1)
     # All rays return at incidences up to 66°, none from 84° on.
     hit &= random.uniform(0, 1, hit.shape) < (facing - 0.1) / 0.3
@@ -349,11 +349,6 @@ def _range_normals(points: Float64, rays: Float64, *, jump: float = 3.0) -> Floa
 def _value(field: Field, points: Float64) -> Float64:
     with torch.no_grad():
         return field.value(torch.from_numpy(points).float()).double().numpy()
-
-
-def _unit_gradient(field: Field, points: Float64) -> Float64:
-    gradient = jet_at(field, points)[1]
-    return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
 
 
 def quantised(ranges: Float64, step: float) -> Float64:

@@ -50,13 +50,13 @@ class Carried:
         kept = []
         for index, (shape, velocity) in enumerate(zip(shapes, self.velocities, strict=True)):
             points = flow(velocity, shape.points(count, 2 * index + seed), 0.0, time)
-            others = [self._at_home(other, points, time) for other in range(len(shapes)) if other != index]
-            outside = [field.value(home) > 0 for field, home in others]
+            outside = [
+                self.fields[other].value(flow(self.velocities[other], points, time, 0.0)) > 0
+                for other in range(len(shapes))
+                if other != index
+            ]
             kept.append(points[torch.stack(outside).all(dim=0)] if outside else points)
         return torch.cat(kept)
-
-    def _at_home(self, index: int, points: Tensor, time: float) -> tuple[Field, Tensor]:
-        return self.fields[index], flow(self.velocities[index], points, time, 0.0)
 
     def _nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
         values, gradients = [], []

@@ -446,7 +446,8 @@ class _Artist:
                         done += 1
                         if progress is not None:
                             progress(done, total)
-                    turned = f"{panel.label}, {self._azimuth(index, len(cameras)):.4g}°"
+                    azimuth = self.options.orbit.azimuth + 360 * index / len(cameras)
+                    turned = f"{panel.label}, {(azimuth + 180) % 360 - 180:.4g}°"
                     lines[-1].append((turned if len(cameras) > 1 else panel.label, np.concatenate(parts)))
             if len(cameras) == 1:
                 lines = [[tile for line in lines for tile in line]]
@@ -457,10 +458,6 @@ class _Artist:
     def _views(self) -> str:
         """What several cameras are called."""
         return "sides" if self.options.sides > 1 else "frames"
-
-    def _azimuth(self, index: int, sides: int) -> float:
-        """Of one of the sides, in degrees from -180 to 180."""
-        return (self.options.orbit.azimuth + 360 * index / sides + 180) % 360 - 180
 
     def caption(self, cameras: Sequence[Camera]) -> str:
         """What was drawn, in a few words."""

@@ -355,14 +355,12 @@ def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
             reason = "is finished" if finished else "holds no interrupted run"
             raise InputError(f"{path}: {reason}, so there is nothing to resume; leave out --resume")
         return path
-    if path.is_dir() and not force and any(map(_could_be_lost, path.iterdir())):
+    harmless = {lock_file(path), path / MERGED_FILE}
+    files = path.iterdir() if path.is_dir() and not force else ()
+    if any(not (file in harmless or PARTIAL.fullmatch(file.name)) for file in files):
         hint = " --resume continues it," if (path / STATE_FILE).is_file() else ""
         raise InputError(f"{path}: exists and is not empty;{hint} --force overwrites it, or choose another -o")
     return path
-
-
-def _could_be_lost(file: Path) -> bool:
-    return not (file == lock_file(file.parent) or file.name == MERGED_FILE or PARTIAL.fullmatch(file.name))
 
 
 def resumes_with(run: Path, record: Mapping[str, Any]) -> str | None:

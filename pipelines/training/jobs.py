@@ -83,13 +83,11 @@ def outcome_of(function: Callable[[Item], Result], item: Item) -> Outcome[Item, 
     except Interrupted:
         raise
     except Exception as error:  # whatever went wrong with one item is no reason to leave out the next
-        return Outcome(item, None, _one_line(error), time.monotonic() - started)
+        text = " ".join(str(error).split())
+        if not isinstance(error, InputError):
+            text = f"{type(error).__name__}: {text}".removesuffix(": ")
+        return Outcome(item, None, text, time.monotonic() - started)
     return Outcome(item, value, None, time.monotonic() - started)
-
-
-def _one_line(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}".removesuffix(": ")
 
 
 def _side_by_side(
@@ -127,7 +125,10 @@ def _side_by_side(
                     outcomes[index] = _collected(ray, done, items[index])
                     report(outcomes[index])
         except KeyboardInterrupt:
-            _stop(ray, list(waiting))
+            # What runs is interrupted, as Ctrl-C would; what waits is forgotten; checkpoints get a minute.
+            for left in waiting:
+                ray.cancel(left)
+            ray.wait(list(waiting), num_returns=len(waiting), timeout=60.0)
             raise
     finally:
         ray.shutdown()
@@ -141,13 +142,6 @@ def _collected(ray: Any, done: Any, item: Item) -> Outcome[Item, Any]:
     except ray.exceptions.RayError as error:
         reason = (str(error).splitlines() or [""])[0]
         return Outcome(item, None, f"{type(error).__name__}: {reason}", math.nan)
-
-
-def _stop(ray: Any, tasks: list[Any]) -> None:
-    """Interrupt what runs, as Ctrl-C would, forget what waits, and give checkpoints a minute to be written."""
-    for task in tasks:
-        ray.cancel(task)
-    ray.wait(tasks, num_returns=len(tasks), timeout=60.0)
 
 
 def _gpus_each(gpus: int, jobs: int) -> float:

@@ -117,7 +117,10 @@ def pack(source: str | Path, options: WebOptions | None = None) -> Packed:
         shape, similarity = read_shape(Path(source))
         return pack_shapes([shape], similarity, options, name=Path(source).stem)
     file = find_field(source)
-    field, similarity, metadata = _loaded(file, options.time)
+    # A moving field keeps its motion where the page can trace it; any other is frozen at its time.
+    saved = load_field(file)
+    moves = options.time is None and isinstance(saved.field, SpaceTimeSDF)
+    field, similarity, metadata = saved if moves else load_still(file, options.time)
     texture = texture_of(file, field) if options.colors and field.in_dim == 3 and options.time is None else None
     if options.levels is not None:
         chosen_level(field, file, options.levels - 1, flag="--levels")
@@ -243,12 +246,6 @@ def _packed(
         **blocks,
     }
     return Packed(whole, data, page)
-
-
-def _loaded(file: Path, time: float | None) -> tuple[Field, Similarity, dict[str, Any]]:
-    """A field that stands still, frozen at its time if it moves and there is one; else a `SpaceTimeSDF`."""
-    saved = load_field(file)
-    return saved if time is None and isinstance(saved.field, SpaceTimeSDF) else load_still(file, time)
 
 
 def _coarse(field: Field, levels: int) -> Field:
