@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -182,19 +182,12 @@ class ColorSiren(nn.Module):
 
     def value(self, x: Tensor) -> Tensor:
         """Colours at ``x`` ``(..., d)`` → ``(..., 3)``."""
-        rows = self._rows(x)
-        parameters = self.siren.folded()
-        blocks = [rows] if needs_graph(rows, parameters) else self._blocks(rows)
-        return torch.cat([forward(part, parameters)[0] for part in blocks]).reshape(*x.shape[:-1], 3)
+        return self._in_blocks(lambda rows, parameters: forward(rows, parameters)[:1], x)[0]
 
     def jet(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Colours ``(..., 3)`` and their Jacobian ``(..., 3, d)`` at ``x`` ``(..., d)``, by sweeps back."""
-        rows = self._rows(x)
-        parameters = self.siren.folded()
-        blocks = [rows] if needs_graph(rows, parameters) else self._blocks(rows)
-        values, gradients = zip(*(plain_jet(part, parameters, 3) for part in blocks), strict=True)
-        shape = (*x.shape[:-1], 3)
-        return torch.cat(values).reshape(shape), torch.cat(gradients).reshape(*shape, x.shape[-1])
+        value, jacobian = self._in_blocks(lambda rows, parameters: plain_jet(rows, parameters, 3), x)
+        return value, jacobian
 
     def derivative_along(self, x: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Colours and their derivative ``∇g(x) v``, both ``(..., 3)``, by one tangent forward.
@@ -204,22 +197,22 @@ class ColorSiren(nn.Module):
         """
         if direction.shape != x.shape:
             raise ValueError(f"direction has shape {tuple(direction.shape)}; expected that of x, {tuple(x.shape)}")
-        rows, tangents = self._rows(x), self._rows(direction)
+        value, derivative = self._in_blocks(_tangent, x, direction)
+        return value, derivative
+
+    def _in_blocks(self, evaluate: Callable[..., Sequence[Tensor]], *points: Tensor) -> list[Tensor]:
+        """Results ``(..., ·)`` of ``evaluate(*rows, parameters)`` at points ``(..., d)``, in blocks if without a graph.
+
+        There is at least one block, so that no points are a legal number of points.
+        """
+        rows = [self.siren.check_points(x).reshape(-1, self.siren.in_dim) for x in points]
         parameters = self.siren.folded()
-        pairs = [(rows, tangents)]
-        if not needs_graph(rows, [tangents, *parameters]):
-            pairs = zip(self._blocks(rows), self._blocks(tangents), strict=True)
-        parts = [_tangent(part, along, parameters) for part, along in pairs]
-        value, derivative = (torch.cat(both) for both in zip(*parts, strict=True))
-        shape = (*x.shape[:-1], 3)
-        return value.reshape(shape), derivative.reshape(shape)
-
-    def _rows(self, x: Tensor) -> Tensor:
-        return self.siren.check_points(x).reshape(-1, self.siren.in_dim)
-
-    def _blocks(self, rows: Tensor) -> tuple[Tensor, ...]:
-        """At least one block, so that no points are a legal number of points."""
-        return rows.split(self.siren.block_rows(rows.device))
+        blocks = [rows]
+        if not needs_graph(rows[0], [*rows[1:], *parameters]):
+            blocks = zip(*(part.split(self.siren.block_rows(part.device)) for part in rows), strict=True)
+        results = [evaluate(*block, parameters) for block in blocks]
+        joined = [torch.cat(parts) for parts in zip(*results, strict=True)]
+        return [whole.reshape(*points[0].shape[:-1], *whole.shape[1:]) for whole in joined]
 
 
 class TextureField(OneLevelField):
