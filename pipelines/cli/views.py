@@ -14,10 +14,7 @@ from ..training.settings import ReconstructConfig, command_line, input_error
 from .common import Command, add_flags, check_output, picture_size, positive, refuse, training, whole, write_json
 
 if TYPE_CHECKING:
-    from ...datasets.views.poses.find_cameras import FoundCameras
-    from ...datasets.views.poses.find_points import FoundPoints
-
-    Found = FoundCameras | FoundPoints
+    from ...datasets.views.poses.colmap_process import Found
 
 
 def _find_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +42,8 @@ def _find(arguments: argparse.Namespace, photos: str, find: Callable[..., Found]
         found = find(photos, arguments.out, report=colmap_report(report))
     tell_found(found)
     print("next:", following)
-    write_json(arguments.json, asdict(found) | {"project": str(arguments.out)})
+    known = {name: value for name, value in asdict(found).items() if value is not None}
+    write_json(arguments.json, known | {"project": str(arguments.out)})
     return 0
 
 

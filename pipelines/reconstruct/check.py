@@ -19,9 +19,8 @@ from ...datasets.cameras import Camera
 from ...datasets.clouds.cleaning.orientation import fibonacci_directions
 from ...datasets.views.formats.shots import DepthMap, DepthSource
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
+from ...datasets.views.poses.colmap_process import Found
 from ...datasets.views.poses.colmap_process import Report as ColmapReport
-from ...datasets.views.poses.find_cameras import FoundCameras
-from ...datasets.views.poses.find_points import FoundPoints
 from ...neural_fields import InputError, Similarity
 from ..mesh.files import write_mesh
 from ..training.progress import Report, counted, silent
@@ -399,10 +398,10 @@ def colmap_report(report: Report | None) -> ColmapReport:
     return lambda stage, done, total: counted(report or silent, stage)(done, total)
 
 
-def said_of(found: FoundCameras | FoundPoints) -> tuple[str, list[str]]:
+def said_of(found: Found) -> tuple[str, list[str]]:
     """What was found, in a line, and what is to be warned of."""
     seen, warnings = f"seen {found.error:.2f} pixels off", []
-    if isinstance(found, FoundCameras):
+    if found.left_out is not None:
         placed = found.photographs - len(found.left_out)
         line = f"{placed} of {found.photographs} photographs placed by {found.points:,} points that are {seen}"
         if found.left_out:

@@ -11,9 +11,10 @@ import signal
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from ....neural_fields import InputError
 from ....neural_fields.backend.files import check_place
@@ -30,7 +31,16 @@ Report = Callable[[str, int, int], None]
 Job = Callable[[Path, Connection], dict[str, Any]]
 """Takes a project and a connection for ``("stage", (name, photographs done))``; returns what `solve` returns."""
 
-T = TypeVar("T")
+
+@dataclass(frozen=True)
+class Found:
+    """The result of `find_cameras` or `find_points`."""
+
+    project: Path  # the folder, which `read_posed_images` reads
+    photographs: int
+    points: int  # number of sparse points
+    error: float  # mean reprojection error, pixels
+    left_out: tuple[str, ...] | None = None  # photographs that could not be placed; None where cameras were known
 
 
 def check_colmap() -> None:
@@ -49,8 +59,8 @@ def fingerprint(files: list[Path]) -> str:
     return digest.hexdigest()
 
 
-def begun(project: Path, asked: dict[str, Any], kind: type[T]) -> T | None:
-    """The result of a finished project, a dataclass ``kind``; else None, and a new project is begun.
+def begun(project: Path, asked: dict[str, Any]) -> Found | None:
+    """The result of a finished project; else None, and a new project is begun.
 
     ``asked`` are the source and the settings. An InputError says that the folder was made of others.
     """
@@ -62,7 +72,7 @@ def begun(project: Path, asked: dict[str, Any], kind: type[T]) -> T | None:
             raise InputError(f"{project}: is not empty, and not a project of ours; name another folder")
         check_place(project)
         project.mkdir(parents=True, exist_ok=True)
-        write_record(project, asked)
+        write_record(project, asked, None)
         return None
     try:
         record = json.loads(record_file.read_text(encoding="utf-8"))
@@ -70,7 +80,7 @@ def begun(project: Path, asked: dict[str, Any], kind: type[T]) -> T | None:
         same = record == asked
         if same and found is not None:
             values = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
-            return kind(**{**values, "project": project})
+            return Found(**{**values, "project": project})
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{record_file}: damaged ({error}); remove the folder, or name another") from error
     if not same:
@@ -81,8 +91,9 @@ def begun(project: Path, asked: dict[str, Any], kind: type[T]) -> T | None:
     return None
 
 
-def write_record(project: Path, record: dict[str, Any]) -> None:
+def write_record(project: Path, asked: dict[str, Any], found: Found | None) -> None:
     """Write the request, and the result under ``found`` if there is one, in one step."""
+    record = asked if found is None else asked | {"found": asdict(found)}
     half = project / f".{RECORD_FILE}"
     text = json.dumps(record, indent=1, default=lambda _: "")  # the only path is that of the project, which may move
     half.write_text(text, encoding="utf-8")

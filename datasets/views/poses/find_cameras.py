@@ -6,7 +6,6 @@ import itertools
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -21,6 +20,7 @@ from .colmap_process import (
     DATABASE_FILE,
     MATCHING,
     OVERLAP,
+    Found,
     Report,
     begun,
     check_colmap,
@@ -39,17 +39,6 @@ SHARPNESS_WIDTH = 480  # pixels; frames are shrunk to this width before their sh
 PLACING = "placing cameras"
 
 
-@dataclass(frozen=True)
-class FoundCameras:
-    """The result of `find_cameras`."""
-
-    project: Path  # the folder, which `read_posed_images` reads
-    photographs: int
-    left_out: tuple[str, ...]  # names of photographs that could not be placed
-    points: int  # number of sparse points
-    error: float  # mean reprojection error, pixels
-
-
 def find_cameras(
     source: str | Path,
     project: str | Path,
@@ -57,7 +46,7 @@ def find_cameras(
     frames: int = 100,
     lens: Literal["auto", "one", "each"] = "auto",
     report: Report | None = None,
-) -> FoundCameras:
+) -> Found:
     """Estimate poses and lenses of a folder of photographs, or of a film, by COLMAP's incremental mapping.
 
     The project gets ``images`` (links to the photographs, or frames of the film) and ``sparse/0``. The same call
@@ -71,7 +60,7 @@ def find_cameras(
     check_colmap()
     photographs = _photographs(source)
     asked = {"source": str(source.resolve()), "frames": frames, "lens": lens, "content": fingerprint(photographs)}
-    if (found := begun(project, asked, FoundCameras)) is not None:
+    if (found := begun(project, asked)) is not None:
         return found
     report = report or (lambda stage, done, total: None)
     images = project / "images"
@@ -85,8 +74,9 @@ def find_cameras(
     pairs = film_pairs(count) if film else count * (count - 1) // 2
     made = solve(project, partial(_reconstructed, one=one, film=film), photographs=count, pairs=pairs, report=report)
     placed = set(made.pop("names"))
-    found = FoundCameras(project, len(names), tuple(name for name in names if name not in placed), **made)
-    write_record(project, asked | {"found": asdict(found)})
+    left_out = tuple(name for name in names if name not in placed)
+    found = Found(project, len(names), left_out=left_out, **made)
+    write_record(project, asked, found)
     return found
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from ..writing import write_colmap
 from .colmap_process import (
     DATABASE_FILE,
     MATCHING,
+    Found,
     Report,
     begun,
     check_colmap,
@@ -35,17 +35,7 @@ MATCHED_VIEWS = 20  # views that each is matched with: those with the nearest di
 GIVEN, PAIRS_FILE = "given", "pairs.txt"  # input of COLMAP: a model with cameras and no points, and pairs of views
 
 
-@dataclass(frozen=True)
-class FoundPoints:
-    """The result of `find_points`."""
-
-    project: Path  # the folder, which `read_posed_images` reads
-    photographs: int
-    points: int  # number of sparse points
-    error: float  # mean reprojection error, pixels
-
-
-def find_points(source: str | Path, project: str | Path, *, report: Report | None = None) -> FoundPoints:
+def find_points(source: str | Path, project: str | Path, *, report: Report | None = None) -> Found:
     """Triangulate sparse points from photographs with fixed cameras, as `read_posed_images` takes them.
 
     The project is a COLMAP model in the same world coordinates: photographs without lens distortion, masks as
@@ -62,15 +52,15 @@ def find_points(source: str | Path, project: str | Path, *, report: Report | Non
     files = [file for shot in shots for file in (shot.image, shot.mask, shot.depth) if file is not None]
     files += [source] if source.is_file() else files_in(source, (".bin", ".txt"))
     asked = {"source": str(source.resolve()), "content": fingerprint([file for file in files if file.is_file()])}
-    if (found := begun(project, asked, FoundPoints)) is not None:
+    if (found := begun(project, asked)) is not None:
         return found
     report = report or (lambda stage, done, total: None)
     if not (project / GIVEN).is_dir():
         _write_given(source, project)
     pairs = (project / PAIRS_FILE).read_text(encoding="utf-8").count("\n")
     made = solve(project, _triangulated, photographs=len(shots), pairs=pairs, report=report)
-    found = FoundPoints(project, len(shots), **made)
-    write_record(project, asked | {"found": asdict(found)})
+    found = Found(project, len(shots), **made)
+    write_record(project, asked, found)
     return found
 
 

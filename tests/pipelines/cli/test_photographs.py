@@ -10,9 +10,7 @@ import trimesh
 from evolutions import fails
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import read_posed_images
-from mplicits.datasets.views.poses.colmap_process import FEATURES
-from mplicits.datasets.views.poses.find_cameras import FoundCameras
-from mplicits.datasets.views.poses.find_points import FoundPoints
+from mplicits.datasets.views.poses.colmap_process import FEATURES, Found
 from mplicits.datasets.views.writing import write_colmap
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.reconstruct import train
@@ -42,12 +40,12 @@ def finder(monkeypatch) -> list[dict[str, Any]]:
     """In COLMAP's place, a function that has the cameras."""
     calls: list[dict[str, Any]] = []
 
-    def find(source: Path, project: Path, **options: Any) -> FoundCameras:
+    def find(source: Path, project: Path, **options: Any) -> Found:
         calls.append({"source": source, "project": project, **options})
         if not project.exists():
             photographs(project)
         options["report"](FEATURES, 1, 4)
-        return FoundCameras(project, 5, ("4.png",), 40, 0.5)
+        return Found(project, 5, 40, 0.5, ("4.png",))
 
     monkeypatch.setattr("mplicits.datasets.views.poses.find_cameras.find_cameras", find)
     return calls
@@ -65,9 +63,9 @@ def test_cameras_are_found_and_what_is_doubtful_is_said(tmp_path, finder: list[d
 
 
 def test_points_are_found_and_few_are_said(tmp_path, monkeypatch, capsys):
-    def find(source: Path, project: Path, *, report: Any) -> FoundPoints:
+    def find(source: Path, project: Path, *, report: Any) -> Found:
         report(FEATURES, 1, 4)
-        return FoundPoints(Path(project), 4, 40, 0.5)
+        return Found(Path(project), 4, 40, 0.5)
 
     photos, project, said = photographs(tmp_path / "photos"), tmp_path / "project", tmp_path / "said.json"
     with monkeypatch.context() as patch:

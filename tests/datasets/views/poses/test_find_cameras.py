@@ -13,7 +13,8 @@ from mplicits.datasets import look_at, read_cameras
 from mplicits.datasets.synthetic.scenes import render_view
 from mplicits.datasets.views.poses import colmap_process
 from mplicits.datasets.views.poses import find_cameras as module
-from mplicits.datasets.views.poses.find_cameras import FoundCameras, find_cameras
+from mplicits.datasets.views.poses.colmap_process import Found
+from mplicits.datasets.views.poses.find_cameras import find_cameras
 from mplicits.neural_fields import InputError
 from photographs import SPECKLED, eyes
 from refusals import refused
@@ -82,7 +83,7 @@ def test_nothing_to_see_is_said(tmp_path: Path) -> None:
 
 def test_what_is_found_is_kept_and_not_sought_again(photographs: Path, tmp_path: Path, solved: list) -> None:
     first = find_cameras(photographs, tmp_path / "project")
-    assert first == FoundCameras(tmp_path / "project", VIEWS, (f"{VIEWS - 1}.png",), 7, 0.25)
+    assert first == Found(tmp_path / "project", VIEWS, 7, 0.25, (f"{VIEWS - 1}.png",))
     assert find_cameras(photographs, tmp_path / "project") == first
     assert [(asked["count"], asked["one"], asked["film"]) for asked in solved] == [(VIEWS, True, False)]
     with pytest.raises(InputError, match="of other settings"):

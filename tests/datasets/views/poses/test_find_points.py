@@ -11,7 +11,8 @@ from mplicits.datasets import look_at, read_cameras
 from mplicits.datasets.synthetic.scenes import render_view
 from mplicits.datasets.views.images import PosedImage, PosedImages, read_posed_images
 from mplicits.datasets.views.poses import find_points as module
-from mplicits.datasets.views.poses.find_points import FoundPoints, find_points, neighbours
+from mplicits.datasets.views.poses.colmap_process import Found
+from mplicits.datasets.views.poses.find_points import find_points, neighbours
 from mplicits.datasets.views.writing import write_transforms
 from mplicits.neural_fields import InputError, Similarity
 from photographs import SPECKLED, eyes
@@ -80,7 +81,7 @@ def test_an_interrupted_search_goes_on_and_a_finished_one_is_kept(
         find_points(photographs, tmp_path / "project")
     written = (tmp_path / "project" / "images" / "000.png").stat().st_mtime_ns
     found = find_points(photographs, tmp_path / "project")
-    assert found == FoundPoints(tmp_path / "project", VIEWS, 7, 0.25)
+    assert found == Found(tmp_path / "project", VIEWS, 7, 0.25)
     assert (tmp_path / "project" / "images" / "000.png").stat().st_mtime_ns == written
     assert find_points(photographs, tmp_path / "project") == found
     assert asked == 2 * [(VIEWS, VIEWS * (VIEWS - 1) // 2)]
