@@ -71,10 +71,15 @@ class PosedImage:
     depth: DepthMap | None = None
 
     @property
-    def in_bytes(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-        """Colours and mask in 8 bits, which are not copied where they are kept so."""
-        color, mask = vars(self)["color"], vars(self)["mask"]
-        return to_bytes(color), None if mask is None else to_bytes(mask)
+    def color_bytes(self) -> NDArray[np.uint8]:
+        """Colours ``(H, W, 3)`` in 8 bits, not copied where they are kept so."""
+        return to_bytes(vars(self)["color"])
+
+    @property
+    def mask_bytes(self) -> NDArray[np.uint8] | None:
+        """The mask ``(H, W)`` in 8 bits, not copied where it is kept so."""
+        mask = vars(self)["mask"]
+        return None if mask is None else to_bytes(mask)
 
 
 @dataclass(frozen=True, eq=False)

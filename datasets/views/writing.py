@@ -59,7 +59,7 @@ def write_neus(folder: str | Path, images: PosedImages) -> None:
         for index, (name, view) in enumerate(_numbered(images)):
             matrices[f"world_mat_{index}"] = _projection(view.camera)
             matrices[f"scale_mat_{index}"] = scale
-            color, mask = view.in_bytes
+            color, mask = view.color_bytes, view.mask_bytes
             _write_png(partial / "image" / name, color)
             _write_png(partial / "mask" / name, np.full_like(color[..., 0], 255) if mask is None else mask)
         np.savez(partial / "cameras_sphere.npz", **matrices)
@@ -218,7 +218,7 @@ def _numbered(images: PosedImages) -> Iterator[tuple[str, PosedImage]]:
 
 
 def _with_alpha(view: PosedImage) -> NDArray[np.uint8]:
-    color, mask = view.in_bytes
+    color, mask = view.color_bytes, view.mask_bytes
     return color if mask is None else np.dstack((color, mask))
 
 

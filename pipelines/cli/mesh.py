@@ -101,7 +101,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         from ..reconstruct.views import count_views
         from ..training.progress import counter_bar
 
-        views = [(view.camera, view.in_bytes[1]) for view in read_posed_images(arguments.photos).views]
+        views = [(view.camera, view.mask_bytes) for view in read_posed_images(arguments.photos).views]
         with counter_bar("photographs") as progress:
             view_counts = functools.partial(count_views, views, progress=progress)
             metrics = evaluate_files(arguments.mesh, arguments.reference, view_counts=view_counts, **options)

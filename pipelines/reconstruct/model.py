@@ -257,8 +257,8 @@ class RayPool:
             parts = [rows[start:end] for rows, run in zip(flat, runs, strict=True) for start, end in run]
             return torch.from_numpy(np.concatenate(parts)).to(device)
 
-        self.colors = joined((view.in_bytes[0] for view in views), 3)
-        self.masks = joined(view.in_bytes[1] for view in views) if self.has_masks else None
+        self.colors = joined((view.color_bytes for view in views), 3)
+        self.masks = joined(view.mask_bytes for view in views) if self.has_masks else None
 
     def __len__(self) -> int:
         return len(self.colors)

@@ -230,7 +230,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
 
     def _masked_cameras(self) -> list[MaskedCamera]:
         """The cameras that were trained on, in unit-sphere coordinates, and their masks."""
-        return [(view.camera.moved(self.similarity), view.in_bytes[1]) for view in self.train_views]
+        return [(view.camera.moved(self.similarity), view.mask_bytes) for view in self.train_views]
 
     @property
     def level(self) -> int:

@@ -435,11 +435,11 @@ def test_pictures_stay_in_the_bits_they_have_and_read_as_float32() -> None:
     view = PosedImage("0.png", camera, levels, between)
     assert view.color.dtype == np.float32
     assert np.array_equal(view.color, levels / np.float32(255))
-    assert view.in_bytes[0] is levels
+    assert view.color_bytes is levels
     assert np.array_equal(view.mask, between)  # numbers that 8 bits do not hold
-    assert np.array_equal(view.in_bytes[1], np.rint(255 * between).astype(np.uint8))
+    assert np.array_equal(view.mask_bytes, np.rint(255 * between).astype(np.uint8))
     copy = replace(view, name="1.png", mask=None)
     assert vars(copy)["color"].dtype == np.uint8
     assert np.array_equal(copy.color, view.color)
     assert copy.mask is None
-    assert copy.in_bytes[1] is None
+    assert copy.mask_bytes is None
