@@ -71,13 +71,13 @@ def evolve(
     started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config, report = folder.config(EvolveConfig, config), progress or silent
     budget = Budget(config.time_budget, started=started)
-    count, shapes = len(config.shapes), []
+    count, shapes, tell = len(config.shapes), [], counted(report, "shapes")
     for path in config.landmarks:
         read_landmarks(path)  # before the shapes, which take their time
     for index, text in enumerate(config.shapes):
-        counted(report, "shapes")(index, count)
+        tell(index, count)
         shapes.append(read_shape(text))
-    counted(report, "shapes")(count, count)
+    tell(count, count)
     load_compiler()
     motion = load_motion(folder.path) if resume and folder.path else None
     # A resumed run has the number of samples that its budget allowed in its settings.
