@@ -1,12 +1,17 @@
 """A page on this machine, and each new version of what it shows: ``mplicits view``, ``fit --watch`` and ``show()``.
 
 The browser draws. The server sends the page, and events that name the newest field, which the page then fetches.
+
+Every user and every visited page of a machine could reach the server. So all paths begin with a random token, which
+only the printed address contains. No cookie is set, so another page's requests carry no rights.
 """
 
 from __future__ import annotations
 
 import errno
+import hmac
 import json
+import secrets
 import socket
 import threading
 from collections.abc import Callable
@@ -19,13 +24,19 @@ from urllib.parse import urlsplit
 from ...neural_fields import InputError
 from .assembly import field_file, fill_page
 from .export import Packed
-from .gate import Gate
 
 PORTS = range(8080, 8180)  # the first free one is taken
+# No other page frames one of ours, caches it or learns its address.
+HEADERS = {
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "SAMEORIGIN",
+    "Cache-Control": "no-store",
+}
 
 
 class PageServer:
-    """Serves what ``pack`` makes until it is closed, as a context manager; only to clients with the token of its `url`.
+    """Serves what ``pack`` makes until it is closed, as a context manager; only under the secret path of its `url`.
 
     It listens at the address ``host``, on the ``port`` or on the first free one from 8080 upwards. ``keep`` is called
     with the JSON that the page posts to ``/landmarks``; None refuses it.
@@ -45,15 +56,17 @@ class PageServer:
         self._pack, self.packed, self.keep = pack, pack(), keep
         self.clients: set[object] = set()
         self.closed = threading.Event()
+        self.host, self.root = host, f"/{secrets.token_urlsafe(18)}/"
         self._server = _listen(host, port, self)
-        self.gate = Gate(host, self._server.server_address[1])
+        self.port = int(self._server.server_address[1])
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
         self._thread.start()
 
     @property
     def url(self) -> str:
         """What a browser on this machine opens."""
-        return self.gate.url
+        local = "127.0.0.1" if self.host in ("0.0.0.0", "::", "") else self.host
+        return f"http://{f'[{local}]' if ':' in local else local}:{self.port}{self.root}"
 
     @property
     def num_clients(self) -> int:
@@ -100,11 +113,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         path, (header, data, _) = self._admitted(), self._page.packed
-        if path == "/":
+        if path == "":
             self._send(HTTPStatus.OK, fill_page(header, data, live=True).encode(), "text/html; charset=utf-8")
-        elif path == "/field.bin":
+        elif path == "field.bin":
             self._send(HTTPStatus.OK, field_file(header, data), "application/octet-stream")
-        elif path == "/live":
+        elif path == "live":
             self._live(self._page)
         elif path is not None:
             self._refuse(HTTPStatus.NOT_FOUND, "There is nothing here.")
@@ -114,7 +127,7 @@ class _Handler(BaseHTTPRequestHandler):
         if (path := self._admitted()) is None:
             return
         length = self.headers.get("Content-Length", "")
-        if path != "/landmarks" or keep is None:
+        if path != "landmarks" or keep is None:
             self._refuse(HTTPStatus.NOT_FOUND, "There is nothing here.")
         elif not length.isdecimal() or int(length) > 1 << 20:
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "Expected at most a megabyte.")
@@ -135,19 +148,20 @@ class _Handler(BaseHTTPRequestHandler):
         return self.server.page
 
     def _admitted(self) -> str | None:
-        """The path of the request; None if it was refused."""
-        self.verdict = self._page.gate.admit(self.path, self.headers)  # pyright: ignore[reportArgumentType]
-        if self.verdict.admitted:
-            return urlsplit(self.path).path
-        self._send(self.verdict.status, self.verdict.body.encode())
+        """The path of the request below the secret one; None if it was refused."""
+        path, root = urlsplit(self.path).path, self._page.root
+        # In the same time for all, so that the token cannot be guessed letter by letter.
+        if hmac.compare_digest(path[: len(root)].encode("utf-8", "replace"), root.encode()):
+            return path[len(root) :]
+        self._refuse(HTTPStatus.FORBIDDEN, "Open the whole address that the command has printed.")
         return None
 
     def _refuse(self, status: HTTPStatus, text: str) -> None:
         self._send(status, f"{text}\n".encode(), "text/plain; charset=utf-8")
 
-    def _send(self, status: HTTPStatus, body: bytes | None, kind: str | None = None) -> None:
+    def _send(self, status: HTTPStatus, body: bytes | None, kind: str) -> None:
         self.send_response(status)
-        for name, text in (*self.verdict.headers.items(), *([] if kind is None else [("Content-Type", kind)])):
+        for name, text in (HEADERS | {"Content-Type": kind}).items():
             self.send_header(name, text)
         if body is not None:
             self.send_header("Content-Length", str(len(body)))

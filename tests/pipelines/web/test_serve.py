@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import socket
 import struct
 import time
@@ -32,56 +33,61 @@ def server(tmp_path):
 
 
 def asked(server, path, **headers):
-    """Status, headers and body of an answer, with the token."""
-    address = f"http://127.0.0.1:{server.gate.port}{path}?token={server.gate.token}"
+    """Status, headers and body of an answer below the secret path."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=30) as answer:
+        with urllib.request.urlopen(urllib.request.Request(server.url + path, headers=headers), timeout=30) as answer:
             return answer.status, answer.headers, answer.read().decode()
     except urllib.error.HTTPError as error:
         return error.code, error.headers, error.read().decode()
 
 
 @contextlib.contextmanager
-def live(server, **headers):
+def live(server):
     """The lines of events that the server sends."""
-    address = f"http://127.0.0.1:{server.gate.port}/live?token={server.gate.token}"
-    with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=30) as answer:
+    with urllib.request.urlopen(f"{server.url}live", timeout=30) as answer:
         yield (int(line.split()[1]) for line in answer if line.startswith(b"data"))
 
 
 def field_of(server):
     """The header of what the server has now."""
-    address = f"http://127.0.0.1:{server.gate.port}/field.bin?token={server.gate.token}"
-    with urllib.request.urlopen(address, timeout=30) as answer:
+    with urllib.request.urlopen(f"{server.url}field.bin", timeout=30) as answer:
         message = answer.read()
     (length,) = struct.unpack_from("<I", message, len(b"mplicits-field\n"))
     return json.loads(message[19 : 19 + length])
 
 
-def test_the_page_is_served_to_who_knows_the_token(server):
-    status, headers, body = asked(server, "/")
+def test_the_page_is_served_to_who_knows_the_address(server):
+    status, headers, body = asked(server, "")
     assert status == 200
     assert headers["Content-Type"].startswith("text/html")
     assert headers["X-Frame-Options"] == "SAMEORIGIN"
     assert "connect-src 'self'" in body
     assert '"format":"mplicits-web"' in body
-    assert asked(server, "/field.safetensors")[0] == 404
-    assert asked(server, "/", Host="evil.example")[0] == 421
-    with pytest.raises(urllib.error.HTTPError, match="403"):
-        urllib.request.urlopen(f"http://127.0.0.1:{server.gate.port}/", timeout=30)
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert headers["Set-Cookie"] is None
+    assert asked(server, "field.safetensors")[0] == 404
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null"])
-def test_other_pages_get_no_events(server, origin):
-    with pytest.raises(urllib.error.HTTPError, match="403"), live(server, Origin=origin):
-        pass
+@pytest.mark.parametrize("path", ["", "live", "field.bin", "{token}x/live", "{half}/live", "%C3%A4%00%F0/", "?{token}"])
+@pytest.mark.parametrize("data", [None, b"[]"])
+def test_nobody_else_gets_or_changes_anything(server, path, data):
+    token = server.root.strip("/")
+    path = path.format(token=token, half=token[:-1])
+    with pytest.raises(urllib.error.HTTPError, match="403") as refused:
+        urllib.request.urlopen(f"http://127.0.0.1:{server.port}/{path}", data, timeout=30)
+    assert token not in refused.value.read().decode()
     assert server.num_clients == 0
+
+
+def test_addresses_are_secret_and_say_where_a_browser_finds_them(server):
+    with PageServer(lambda: server.packed, host="0.0.0.0") as other:
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{20,}/", other.url)
+        assert other.root != server.root
 
 
 def test_each_checkpoint_is_named_once_to_who_looks(tmp_path, server):
     first = server.packed.header["crc32"]
-    own = f"http://127.0.0.1:{server.gate.port}"
-    with Watcher(tmp_path, server=server, look_every=0.01) as watcher, live(server, Origin=own) as events:
+    with Watcher(tmp_path, server=server, look_every=0.01) as watcher, live(server) as events:
         assert next(events) == first
         assert field_of(server)["crc32"] == first
         checkpoint(tmp_path, levels=2)
@@ -106,7 +112,7 @@ def test_nothing_is_made_while_nobody_looks(tmp_path, server):
 
 
 def test_broken_requests_end_nothing(server, capfd):
-    place = ("127.0.0.1", server.gate.port)
+    place = ("127.0.0.1", server.port)
     long = b"GET /" + b"x" * 100_000 + b" HTTP/1.1\r\n\r\n"
     for data in (b"\x00\xff\r\n\r\n", long, b"POST / HTTP/1.1\r\n\r\n", b""):
         with socket.create_connection(place, timeout=10) as client, contextlib.suppress(OSError):
@@ -114,13 +120,13 @@ def test_broken_requests_end_nothing(server, capfd):
             client.shutdown(socket.SHUT_WR)
             while client.recv(1 << 16):
                 pass
-    assert asked(server, "/")[0] == 200
+    assert asked(server, "")[0] == 200
     assert capfd.readouterr().err == ""
 
 
 def test_ports(server):
-    with pytest.raises(InputError, match=f"--port {server.gate.port}: is in use"):
-        PageServer(lambda: server.packed, port=server.gate.port)
+    with pytest.raises(InputError, match=f"--port {server.port}: is in use"):
+        PageServer(lambda: server.packed, port=server.port)
     with pytest.raises(InputError, match=r"--host 203\.0\.113\.1: cannot listen"):
         PageServer(lambda: server.packed, host="203.0.113.1")
 

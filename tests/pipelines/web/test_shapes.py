@@ -205,7 +205,7 @@ def test_landmarks_are_clicked(browser, tmp_path):
         ball(tmp_path / f"{name}.safetensors")
     pairs = Pairs((tmp_path / "a.safetensors", tmp_path / "b.safetensors"), tmp_path / "pairs.txt")
     with PageServer(pairs.pack, keep=pairs.keep) as server:
-        browser.get(f"{server.url}&pixel=16&webgl")
+        browser.get(f"{server.url}?pixel=16&webgl")
         until(lambda: browser.find_elements("id", "undo"))
         click = "return begun.then((page) => page.tools.landmarks.pick(arguments[0]))"
         browser.execute_script(click, [0.7, 0.0, 0.0])
