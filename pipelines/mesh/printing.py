@@ -9,9 +9,8 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
-from torch import Tensor
 
-from ...neural_fields import Field, Mesh, Similarity, project_to_surface
+from ...neural_fields import Field, Mesh, Similarity, project_to_surface, sphere_trace
 from ...neural_fields.fields.similarity import FRAMES, Placement
 from ..surface.surface import components, sample_points
 
@@ -29,35 +28,19 @@ class Thickness(NamedTuple):
 
 
 @torch.no_grad()
-def thickness(
-    field: Field, points: Float64, *, level: int = -1, first: float = 1e-3, least: float = 4e-3, farthest: float = 2.1
-) -> Thickness:
+def thickness(field: Field, points: Float64, *, level: int = -1) -> Thickness:
     """The length of the way from points ``(N, 3)`` near a surface inward along the normal to the other side.
 
-    Exact in slabs, tubes and balls; elsewhere more than the largest ball would be. ``first`` is the first step under
-    the surface and ``least`` the least one after it; beyond ``farthest`` a ray has left the unit sphere.
+    Exact in slabs, tubes and balls; elsewhere more than the largest ball would be.
     """
     feet, reached = project_to_surface(field, torch.from_numpy(points).to(field.like), level=level)
     inward = -torch.nn.functional.normalize(field.jet(feet, level=level).gradient, dim=-1)
-
-    def values(depth: Tensor, rows: Tensor) -> Tensor:
-        return field.value(feet[rows] + depth[:, None] * inward[rows], level=level)
-
-    low, high = torch.zeros(len(feet)).to(feet), torch.full((len(feet),), first).to(feet)
-    open_rows = torch.arange(len(feet), device=feet.device)
-    while len(open_rows):
-        value = values(high[open_rows], open_rows)
-        inside = (value < 0) & (high[open_rows] < farthest)
-        open_rows, value = open_rows[inside], value[inside]
-        low[open_rows] = high[open_rows]
-        high[open_rows] += (-value / 1.25).clamp(min=least)  # |∇f| up to 1.25, as for `extract_mesh`
-    rows = torch.arange(len(feet), device=feet.device)
-    never = high >= farthest
-    for _ in range(16):  # bisections: a step of 4e-3 becomes 6e-8
-        middle = (low + high) / 2
-        inside = values(middle, rows) < 0
-        low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
-    found = ((low + high) / 2).masked_fill(never, torch.inf).masked_fill(~reached, torch.nan)
+    # Feet are within 1e-5 of the surface; rays that begin inside of it are traced to where they come out.
+    begin = 2e-5
+    out = sphere_trace(
+        field, feet + begin * inward, inward, level=level, tolerance=1e-7, lipschitz=1.25, radius=None, far=2.1
+    )
+    found = (out.depth + begin).masked_fill(~out.mask, torch.inf).masked_fill(~reached, torch.nan)
     return Thickness(found.cpu().double().numpy(), feet.cpu().double().numpy())
 
 
