@@ -17,7 +17,7 @@ from ...datasets.synthetic.samples import feet_and_normals
 from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.backend.files import check_place
 from ...neural_fields.fields.similarity import Placement
-from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.extract import Mesh, extract_mesh, surface_needed
 from ..fit.train import Run, fit
 from ..mesh.files import write_mesh
 from ..render.picture import Image, contact_sheet, write_picture
@@ -73,7 +73,8 @@ def demo(
         mesh_count = counted(report, "meshes")
         for level in range(levels):
             mesh_count(level, levels)
-            meshes.append(_extract(run.field, level, resolution))
+            with surface_needed(f"level {level} has no surface; is the cloud a surface, are its normals?"):
+                meshes.append(extract_mesh(run.field, level=level, resolution=resolution))
         finest = spread_colors(meshes[-1], points, run.similarity)
         # The mesh in the scan's coordinates, and one for other programs: upright, in metres, at the origin.
         placement = Placement("z", "mm", center=True) if cloud is None else Placement(asked_up, center=True)
@@ -89,13 +90,6 @@ def demo(
     print("\n".join(said))
     print(f"{out / 'mesh.ply'}, mesh.glb, picture.png, run/: {time.monotonic() - started:.0f} s in all")
     return 0
-
-
-def _extract(field: Field, level: int, resolution: int) -> Mesh:
-    try:
-        return extract_mesh(field, level=level, resolution=resolution)
-    except NoSurfaceError as error:
-        raise InputError(f"level {level} has no surface ({error}); is the cloud a surface, are its normals?") from error
 
 
 def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity) -> Mesh:

@@ -30,7 +30,7 @@ from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
 from .picture import Image, check_picture_path, contact_sheet, write_picture
 from .rasterise import cloud_view, mesh_view, read_painted
-from .shade import ShadeOptions, compose, default_shading, downsample, load_matcap, measure, shade, value_limits
+from .shade import SCALES, ShadeOptions, compose, default_shading, downsample, load_matcap, measure, shade, value_limits
 from .trace import Seen, fine_strips, trace_view
 
 Float64 = NDArray[np.float64]
@@ -452,7 +452,7 @@ class _Artist:
             if len(cameras) == 1:
                 lines = [[tile for line in lines for tile in line]]
             alone = len(lines) == len(lines[0]) == 1
-            yield self._with_legend(lines[0][0][1] if alone else contact_sheet(*lines), cameras[0], alone=alone)
+            yield self._with_legend(lines[0][0][1] if alone else contact_sheet(*lines), alone=alone)
 
     @property
     def _views(self) -> str:
@@ -511,18 +511,11 @@ class _Artist:
             detail=self.shade_options.detail,
         )
 
-    def _with_legend(self, picture: Image, camera: Camera, *, alone: bool) -> Image:
+    def _with_legend(self, picture: Image, *, alone: bool) -> Image:
         limits = self.shade_options.limits
         if not self.options.legend or self.shading not in MEASURES or limits is None:
             return picture
         title = MEASURES[self.shading][0]
         shown = (limits[0] * self.unit, limits[1] * self.unit)
         paper = self.options.background if alone else (1.0, 1.0, 1.0)
-        return with_color_bar(picture, self._scale(camera, limits), shown, title=title, background=paper)
-
-    def _scale(self, camera: Camera, limits: tuple[float, float]) -> NDArray[np.float32]:
-        """The colours ``(256, 3)`` of the map, as a surface that faces the eye shows them."""
-        values = torch.linspace(*limits, 256)
-        forward = camera.forward.float().expand(256, 3)
-        facing = Seen((256, 1), torch.arange(256), values, forward, -forward, forward)
-        return shade(facing, self.shading, camera=camera, options=self.shade_options, values=values).numpy()
+        return with_color_bar(picture, SCALES[self.shading], shown, title=title, background=paper)

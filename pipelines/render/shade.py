@@ -121,29 +121,14 @@ def _light_through(u: Tensor) -> Tensor:
 def level_set_curvature(field: Field, points: Tensor, *, level: int = -1, step: float = 2e-3) -> Tensor:
     """H = ½ div(∇f / |∇f|) ``(P,)`` of the level set through each point, by central differences: 1/r on a sphere.
 
-    The unit gradient n changes only within the tangent plane, so that along two tangents a and b, with h = ``step``,
-
-        2 H = ⟨a, n(p + h a) − n(p − h a)⟩ / 2h + ⟨b, n(p + h b) − n(p − h b)⟩ / 2h.
-
-    Convex is positive; where the gradient is zero, H is 0. The error grows with h² and with (rounding of n) / h.
+    With the unit gradient n, h = ``step`` and the axes eᵢ, 2 H = Σᵢ (nᵢ(p + h eᵢ) − nᵢ(p − h eᵢ)) / 2h. Convex is
+    positive. The error grows with h² and with (rounding of n) / h.
     """
     if not step > 0:
         raise ValueError(f"step={step}: expected a number > 0")
-    tangents = _tangents(normalize(field.jet(points, level=level).gradient, dim=-1))  # (2, P, 3)
-    offsets = step * torch.stack((tangents, -tangents))  # (2, 2, P, 3)
-    normals = normalize(field.jet(points + offsets, level=level).gradient, dim=-1)
-    return (tangents * (normals[0] - normals[1])).sum((0, -1)) / (4 * step)
-
-
-def _tangents(n: Tensor) -> Tensor:
-    """Two unit tangents ``(2, P, 3)`` across unit normals (Duff et al. 2017, "Building an orthonormal basis")."""
-    x, y, z = n.unbind(-1)
-    sign = torch.where(z < 0, -1.0, 1.0).to(n.dtype)
-    a = -1 / (sign + z)
-    b = x * y * a
-    first = torch.stack((1 + sign * x * x * a, sign * b, -sign * x), -1)
-    second = torch.stack((b, sign + y * y * a, -y), -1)
-    return torch.stack((first, second))
+    offsets = step * torch.eye(3).to(points)[:, None]  # (3, 1, 3)
+    ahead, behind = (normalize(field.jet(points + o, level=level).gradient, dim=-1) for o in (offsets, -offsets))
+    return (ahead - behind).diagonal(dim1=0, dim2=2).sum(-1) / (4 * step)
 
 
 def load_matcap(name: str | Path) -> Tensor:
@@ -253,7 +238,6 @@ class Lamps:
 
 
 LAMPS = Lamps()
-_MAPS = {"depth": "viridis", "curvature": "diverging", "error": "magma"}
 
 
 def _from_opencv(name: int) -> Float32:
@@ -275,6 +259,14 @@ COLOR_MAPS: dict[str, Float32] = {
     "diverging": _between(
         ((0.09, 0.25, 0.55), (0.36, 0.60, 0.83), (0.94, 0.94, 0.92), (0.90, 0.52, 0.34), (0.60, 0.10, 0.14))
     ),
+}
+
+
+# From the low end of the numbers to the high one: what is near is light, what is far from the reference dark.
+SCALES = {
+    "depth": COLOR_MAPS["viridis"][::-1].copy(),
+    "curvature": COLOR_MAPS["diverging"],
+    "error": COLOR_MAPS["magma"][::-1].copy(),
 }
 
 
@@ -322,9 +314,7 @@ def shade(
         return sample_matcap(load_matcap(options.matcap) if matcap is None else matcap, _view_normals(seen, camera))
     if values is None:
         values = measure(seen, shading, field=field, level=level, detail=options.detail)
-    low, high = value_limits(values, shading, options)
-    # What is near is light, what is far from the reference dark: of those two maps the light end is the high one.
-    colors = apply_color_map(values, (low, high) if shading == "curvature" else (high, low), COLOR_MAPS[_MAPS[shading]])
+    colors = apply_color_map(values, value_limits(values, shading, options), SCALES[shading])
     if shading == "depth":
         return colors
     return colors * (1 - options.relief * (1 - _facing(seen)))[:, None]
