@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import math
 import unicodedata
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -113,14 +113,12 @@ def _ticks(limits: tuple[float, float], count: int) -> list[tuple[float, str]]:
     return [(float(n * step), f"{n * step:.{digits}f}".replace("-", "−")) for n in numbers]
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """A drawing and the words after it; ``draw`` paints on ``(rows, width, 3)`` float RGB, ``rows`` high."""
+class _Entry(NamedTuple):
+    """Words, and before them a sample ``(rows, columns, 3)`` of what they name; ``least`` is the room it takes."""
 
-    width: int
     words: str
-    draw: Callable[[Floats], None]
-    least: int = 0  # room it takes at least
+    sample: Floats
+    least: int = 0
 
 
 def with_legend(
@@ -134,19 +132,21 @@ def with_legend(
     text = round(float(np.clip(width / 48, 9, 40)))
     entries = _entries(taken, text, width, caption=caption, iso_step=iso_step, unit=unit, bands=bands)
     margin, gap, row = text, round(1.6 * text), round(1.9 * text)
-    room = [max(entry.least, entry.width + text // 2 + text_width(entry.words, text)) for entry in entries]
+    starts = [entry.sample.shape[1] + text // 2 if entry.sample.size else 0 for entry in entries]
     places, x, line = [], margin, 0
-    for needed in room:
+    for entry, start in zip(entries, starts, strict=True):
+        needed = max(entry.least, start + text_width(entry.words, text))
         if x > margin and x + needed > width - margin:
             x, line = margin, line + 1
         places.append((x, line))
         x += needed + gap
     strip = np.ones((row * (line + 1) + text, width, 3), np.float32)
-    for entry, (left, line) in zip(entries, places, strict=True):
-        top = text // 2 + line * row
-        entry.draw(strip[top : top + row, left : left + entry.width])
-        start = left + (entry.width + text // 2 if entry.width else 0)
-        _write(strip, entry.words, (start, top + row // 2), text, INK)
+    for entry, start, (left, line) in zip(entries, starts, places, strict=True):
+        height, columns = entry.sample.shape[:2]
+        middle = text // 2 + line * row + row // 2
+        shown = strip[middle - height // 2 :][:height, left : left + columns]
+        shown[:] = entry.sample[:, : shown.shape[1]]
+        _write(strip, entry.words, (left + start, middle), text, INK)
     return np.concatenate((picture, to_bytes(strip)))
 
 
@@ -155,55 +155,35 @@ def _entries(
 ) -> list[_Entry]:
     height = taken.levels[-1].shape[0]
     bar = round_step(0.12 * width * taken.pixel * unit)
-    pixels = max(1, round(bar / (taken.pixel * unit)))
     reach = STYLE.fade * taken.pixel * height / 2
+    far = np.linspace(-2.5 * reach, 2.5 * reach, 5 * text, dtype=np.float32)
+    near = np.linspace(-1, 1, 2 * text, dtype=np.float32)
+    gray = (0.45, 0.45, 0.45)
     entries = [
         # Wide enough for any number, so that nothing moves in an animation.
-        _Entry(0, caption, lambda _area: None, least=round(9.5 * text)),
-        _Entry(pixels, f"{bar:g}", _scale_bar),
-        _Entry(5 * text, "inside, outside", lambda area: _ramp(area, reach)),
-        _Entry(
-            2 * text, f"iso-lines every {iso_step * unit:.6g}", lambda area: _line(area, (0.45, 0.45, 0.45), STYLE.line)
-        ),
+        _Entry(caption, _sample(0, 0, INK), least=round(9.5 * text)),
+        _Entry(f"{bar:g}", _sample(2, max(1, round(bar / (taken.pixel * unit))), INK)),
+        _Entry("inside, outside", _sample(text // 2, 5 * text, distance_color(far, reach=reach, slope=reach / text))),
+        _Entry(f"iso-lines every {iso_step * unit:.6g}", _sample(round(STYLE.line * text / 16), 2 * text, gray)),
     ]
     count = len(taken.levels)
     for index in range(count):
         finest = index == count - 1 and taken.finest
-        color = FINEST if finest else level_color(index)
+        color = level_color(index)
         name = f"f{index}".translate(SUBSCRIPTS)
-        entries.append(_Entry(2 * text, f"{name} = 0", lambda area, color=color: _line(area, color, 2.5)))
+        entries.append(_Entry(f"{name} = 0", _sample(text // 6, 2 * text, FINEST if finest else color)))
         if bands and index < len(taken.deltas):
             words = f"|{name}| < {f'δ{index}'.translate(SUBSCRIPTS)} = {taken.deltas[index] * unit:.3g}"
-            entries.append(_Entry(2 * text, words, lambda area, index=index: _swatch(area, level_color(index))))
+            # A band as it looks: its tint over both sides of the surface.
+            sides = distance_color(near, reach=20.0, slope=0.1)
+            tinted = (1 - STYLE.tint) * sides + np.multiply(STYLE.tint, color)
+            entries.append(_Entry(words, _sample(text, 2 * text, tinted)))
     return entries
 
 
-def _scale_bar(area: Floats) -> None:
-    middle, tick = area.shape[0] // 2, area.shape[0] // 6
-    area[middle - 1 : middle + 1] = INK
-    area[middle - tick : middle + tick, [0, 1, -2, -1]] = INK
-
-
-def _ramp(area: Floats, reach: float) -> None:
-    third = area.shape[0] // 3
-    distance = np.linspace(-2.5 * reach, 2.5 * reach, area.shape[1]).astype(np.float32)
-    area[third:-third] = distance_color(distance, reach=reach, slope=5 * reach / area.shape[1])
-
-
-def _line(area: Floats, color: Color, width: float) -> None:
-    middle = area.shape[0] // 2
-    rows = round(max(1, width * area.shape[0] / 32))
-    area[middle - rows // 2 : middle - rows // 2 + rows] = color
-
-
-def _swatch(area: Floats, color: Color) -> None:
-    """A band as it looks: its tint over both sides of the surface, with its outline."""
-    third = area.shape[0] // 4
-    box = area[third:-third]
-    box[:] = color
-    inner = box[1:-1, 1:-1]
-    distance = np.linspace(-1, 1, inner.shape[1]).astype(np.float32)
-    inner[:] = (1 - STYLE.tint) * distance_color(distance, reach=20.0, slope=0.1) + np.multiply(STYLE.tint, color)
+def _sample(rows: int, columns: int, color: Floats | Color) -> Floats:
+    """One colour, or one for each column, over a box at least a pixel high."""
+    return np.broadcast_to(np.asarray(color, np.float32), (max(1, rows), columns, 3))
 
 
 def _write(strip: Floats, words: str, place: tuple[int, int], text: int, ink: Color) -> None:
