@@ -158,12 +158,12 @@ def evaluate_surfaces(
     points, normals = sample_points(mesh, samples, of_mesh)
     target, target_normals = sample_points(reference, samples, of_reference)
 
-    forward, nearest = KDTree(target, balanced_tree=False).query(points, workers=-1)
-    backward, nearest_back = KDTree(points, balanced_tree=False).query(target, workers=-1)
+    ways = _ways(points, target)
+    forward, backward = ways.there, ways.back
     consistency = None
     if normals is not None and target_normals is not None:
-        there = np.abs((normals * target_normals[nearest]).sum(axis=1)).mean()
-        back = np.abs((target_normals * normals[nearest_back]).sum(axis=1)).mean()
+        there = np.abs((normals * target_normals[ways.nearest]).sum(axis=1)).mean()
+        back = np.abs((target_normals * normals[ways.nearest_back]).sum(axis=1)).mean()
         consistency = float(there + back) / 2
 
     notes, closed = [], is_closed(mesh)
@@ -172,15 +172,14 @@ def evaluate_surfaces(
         notes.append("the reference is a point cloud: distances are to its points; no floor, no iou")
     else:
         again = _ways(sample_points(reference, samples, of_floor)[0], target)
-        floor = float(again.there.mean() + again.back.mean())
+        floor = sum(again.squared())
         if view_counts is not None:
             seen = view_counts(given, similarity.to_input(target)) > 0
-            ways = (_Ways(forward**2, np.asarray(nearest), backward**2), again)
-            visible = Visible(float(seen.mean()), *(_distances_where(seen, way, similarity.scale) for way in ways))
+            visible = Visible(float(seen.mean()), *(w.distances_where(seen, similarity.scale) for w in (ways, again)))
         iou, iou_notes = _iou(mesh, reference, columns, closed=closed)
         notes.extend(iou_notes)
     precision, recall = float((forward < threshold).mean()), float((backward < threshold).mean())
-    accuracy, completeness = float((forward**2).mean()), float((backward**2).mean())
+    accuracy, completeness = ways.squared()
     return Metrics(
         chamfer=accuracy + completeness,
         chamfer_floor=floor,
@@ -208,31 +207,35 @@ def evaluate_surfaces(
 
 def chamfer(a: Float64, b: Float64) -> tuple[float, float]:
     """Mean squared distances of ``a`` ``(N, 3)`` to ``b`` ``(M, 3)``, and back; the tables give their sum."""
-    ways = _ways(a, b)
-    return float(ways.there.mean()), float(ways.back.mean())
+    return _ways(a, b).squared()
 
 
 class _Ways(NamedTuple):
-    """Squared distances of samples ``(N,)`` to the reference's, the nearest of these, and the way back ``(M,)``."""
+    """Distances of samples ``(N,)`` to the reference's, and back ``(M,)``, and the indices of the nearest ones."""
 
     there: Float64
     nearest: Int64
     back: Float64
+    nearest_back: Int64
+
+    def squared(self) -> tuple[float, float]:
+        """Mean squared distances, both ways."""
+        return float((self.there**2).mean()), float((self.back**2).mean())
+
+    def distances_where(self, visible: NDArray[np.bool_], scale: float) -> Distances:
+        """Mean distances, times ``scale``, where samples of the reference are ``visible`` ``(M,)``."""
+        there, back = self.there[visible[self.nearest]], self.back[visible]
+        if not (len(there) and len(back)):
+            return Distances(None, None, None)
+        accuracy, completeness = scale * float(there.mean()), scale * float(back.mean())
+        return Distances(accuracy, completeness, (accuracy + completeness) / 2)
 
 
 def _ways(a: Float64, b: Float64) -> _Ways:
     """From samples of a surface ``(N, 3)`` to those of the reference ``(M, 3)``, and back."""
-    forward, nearest = KDTree(b, balanced_tree=False).query(a, workers=-1)
-    backward, _ = KDTree(a, balanced_tree=False).query(b, workers=-1)
-    return _Ways(np.asarray(forward) ** 2, np.asarray(nearest), np.asarray(backward) ** 2)
-
-
-def _distances_where(visible: NDArray[np.bool_], ways: _Ways, scale: float) -> Distances:
-    there, back = ways.there[visible[ways.nearest]], ways.back[visible]
-    if not (len(there) and len(back)):
-        return Distances(None, None, None)
-    accuracy, completeness = (scale * float(np.sqrt(squared).mean()) for squared in (there, back))
-    return Distances(accuracy, completeness, (accuracy + completeness) / 2)
+    there, nearest = KDTree(b, balanced_tree=False).query(a, workers=-1)
+    back, nearest_back = KDTree(a, balanced_tree=False).query(b, workers=-1)
+    return _Ways(np.asarray(there), np.asarray(nearest), np.asarray(back), np.asarray(nearest_back))
 
 
 def shell_iou(a: Float64, b: Float64, *, voxel: float = 0.01) -> float:
