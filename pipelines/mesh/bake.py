@@ -21,7 +21,6 @@ from .files import check_textured_path, write_textured
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Attribute = Callable[[Float64], NDArray[np.floating]]
-Progress = Callable[[str, int, int], None]
 
 
 class Baked(NamedTuple):
@@ -40,7 +39,6 @@ def bake(
     normals_at: Attribute | None,
     *,
     size: int = 2048,
-    progress: Progress | None = None,
     batch: int = 1 << 17,
 ) -> Baked:
     """Colour and normal at the point of an unwrapped mesh under the centre of each of ``size``² texels.
@@ -69,8 +67,6 @@ def bake(
                 directions = unit_rows(np.asarray(normals_at(points)))
                 frame = (_interpolated(rows, corners, weights) for rows in (mesh.normals, mesh.tangents))
                 normal[texel] = _encoded(to_frame(directions, *frame))
-        if progress is not None and len(found.face):
-            progress("bake", int(found.face.max()) + 1, len(mesh.faces))
     if not covered.any():
         raise ValueError(f"size: no triangle covers a texel at {size}; expected more texels")
     nearest = distance_transform_edt(~covered.reshape(size, size), return_distances=False, return_indices=True)
@@ -106,20 +102,16 @@ def textured_mesh(
     size: int = 2048,
     faces: int = 50_000,
     placement: Placement | None = None,
-    progress: Progress | None = None,
 ) -> Mesh:
     """Decimate, unwrap, bake, and write a textured GLB, or an OBJ with its MTL and PNG files → the mesh as written.
 
     Mesh and points are in unit-sphere coordinates. ``colors_at`` and ``normals_at`` (see `bake`) get points of the
     decimated mesh, near the surface. ``size`` is the side of the textures in texels, ``faces`` the triangles to keep.
-    ``progress`` is called with the stage ("unwrap", "bake"), how much of it is done, and of how much. Raises
-    InputError.
+    Raises InputError.
     """
     path = check_textured_path(path, similarity)
     check_texture_size(size)
-    if progress is not None:
-        progress("unwrap", 0, 1)
     unwrapped = unwrap(*decimate(mesh.vertices, mesh.faces, faces), size=size)
-    color, normal = bake(unwrapped, colors_at, normals_at, size=size, progress=progress)
+    color, normal = bake(unwrapped, colors_at, normals_at, size=size)
     write_textured(path, unwrapped, similarity, color=color, normal=normal, placement=placement)
     return unwrapped
