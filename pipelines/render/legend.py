@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import unicodedata
 from collections.abc import Sequence
@@ -22,21 +21,15 @@ STROKES = 30  # size of the type whose capitals are as high as those of the stro
 
 def text_width(words: str, size: int) -> int:
     """Pixels that words take, ``size`` pixels from the top of one line to the top of the next."""
-    if _has_fonts():
-        return int(cv2.getTextSize((0, 0), words, (0, 0), _font(), size)[2])
-    return int(cv2.getTextSize(plain(words), cv2.FONT_HERSHEY_SIMPLEX, size / STROKES, 1)[0][0])
+    return int(cv2.getTextSize(_drawable(words), cv2.FONT_HERSHEY_SIMPLEX, size / STROKES, 1)[0][0])
 
 
 def text_mask(shape: tuple[int, int], words: str, place: tuple[int, int], size: int) -> NDArray[np.float32]:
     """Coverage ``(rows, columns)`` in [0, 1] of one line of words; ``place`` is the middle of their left side."""
-    mask = np.zeros((*shape, 3), np.uint8)
+    mask = np.zeros(shape, np.uint8)
     base = (place[0], place[1] + round(0.36 * size))
-    white = (255, 255, 255)
-    if _has_fonts():
-        cv2.putText(mask, words, base, white, _font(), size)
-    else:
-        cv2.putText(mask, plain(words), base, cv2.FONT_HERSHEY_SIMPLEX, size / STROKES, white, 1, cv2.LINE_AA)
-    return mask[..., 0].astype(np.float32) / np.float32(255)
+    cv2.putText(mask, _drawable(words), base, cv2.FONT_HERSHEY_SIMPLEX, size / STROKES, 255, 1, cv2.LINE_AA)
+    return mask.astype(np.float32) / np.float32(255)
 
 
 def plain(words: str) -> str:
@@ -45,15 +38,9 @@ def plain(words: str) -> str:
     return folded.encode("ascii", "ignore").decode()
 
 
-def _has_fonts() -> bool:
-    """Whether OpenCV is 5 or later; an environment with nerfstudio has 4.10."""
-    return hasattr(cv2, "FontFace")
-
-
-@functools.cache
-def _font() -> cv2.FontFace:
-    """OpenCV's own sans-serif, which has all of Unicode that we write."""
-    return cv2.FontFace("uni")
+def _drawable(words: str) -> str:
+    """Words that OpenCV can draw: from version 5 on all that we write; an environment with nerfstudio has 4.10."""
+    return words if hasattr(cv2, "FontFace") else plain(words)
 
 
 Floats = NDArray[np.float32]
