@@ -18,9 +18,7 @@ PICTURES = (".png", ".jpg", ".jpeg")
 FILMS = (".mp4", ".gif")
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "gray": (0.5, 0.5, 0.5), "transparent": None}
 RADIANCE = "radiance"
-# Settings that one shading alone heeds.
-MEASURED = ("depth", "curvature", "error")
-OWNED = {"limits": MEASURED, "matcap": ("matcap",), "reference": ("error",)}
+MEASURED = ("depth", "curvature", "error")  # shadings that show numbers
 
 
 def _draw(out: Path, title: str | None, work: Callable[[Callable[[int, int], None] | None], str]) -> int:
@@ -106,13 +104,12 @@ def _render(arguments: argparse.Namespace) -> int:
 
 
 def _shading(arguments: argparse.Namespace, given: dict[str, object]) -> str | None:
-    """The shading given by a flag; ``--matcap`` and ``--reference`` imply theirs."""
-    asked = {name for name in OWNED if name in given or getattr(arguments, name, None) is not None}
-    wanted = [OWNED[name][0] for name in ("matcap", "reference") if name in asked]
-    shading = arguments.shading or (wanted[0] if wanted else None)
-    for name in sorted(asked):
-        if shading not in OWNED[name]:
-            raise input_error(f"--{name}: goes with --shading {' or '.join(OWNED[name])}")
+    """The shading given by a flag; ``--reference`` implies its own."""
+    shading = arguments.shading or (None if arguments.reference is None else "error")
+    if arguments.reference is not None and shading != "error":
+        raise input_error("--reference: goes with --shading error")
+    if "limits" in given and shading not in MEASURED:
+        raise input_error(f"--limits: goes with --shading {' or '.join(MEASURED)}")
     return shading
 
 
@@ -222,7 +219,7 @@ SLICE = Command(
 
 
 MOVING = (*FILMS, ".png")
-ANIMATED_SHADINGS = ("lambert", "headlight", "normals", "matcap", "color")
+ANIMATED_SHADINGS = ("lambert", "headlight", "normals", "color")
 
 
 def _animate_arguments(parser: argparse.ArgumentParser) -> None:

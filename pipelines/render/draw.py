@@ -30,7 +30,7 @@ from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
 from .picture import Image, check_picture_path, contact_sheet, write_picture
 from .rasterise import cloud_view, mesh_view, read_painted
-from .shade import SCALES, ShadeOptions, compose, default_shading, downsample, load_matcap, measure, shade, value_limits
+from .shade import SCALES, ShadeOptions, compose, default_shading, downsample, measure, shade, value_limits
 from .trace import Seen, fine_strips, trace_view
 
 Float64 = NDArray[np.float64]
@@ -411,7 +411,6 @@ class _Artist:
             low, high = options.shade.limits
             shading_options = dataclasses.replace(shading_options, limits=(low / self.unit, high / self.unit))
         self.shade_options = shading_options
-        self.matcap = load_matcap(options.shade.matcap) if self.shading == "matcap" else None
         self.reference = reference_distance(subject, options.reference) if self.shading == "error" else None
         self.anything = False
 
@@ -494,7 +493,6 @@ class _Artist:
             field=self.subject.field,
             level=panel.level,
             options=self.shade_options,
-            matcap=self.matcap,
             values=self._measure(seen, panel) if self.shading in MEASURES else None,
         )
 

@@ -1,4 +1,4 @@
-"""Colours for what an image sees: shadings, shadows, occlusion, curvature and matcaps, as functions of `Seen`.
+"""Colours for what an image sees: shadings, shadows, occlusion and curvature, as functions of `Seen`.
 
 Fields, meshes and clouds, in pictures and films, share these lamps and colour maps.
 """
@@ -8,17 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import grid_sample, normalize
+from torch.nn.functional import normalize
 
 from ...datasets.cameras import Camera
-from ...neural_fields import Field, InputError
+from ...neural_fields import Field
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, ball_crossing
 from ..training.settings import SHADINGS, ShadeOptions
 from .picture import Image
@@ -26,7 +25,6 @@ from .trace import Seen
 
 Float32 = NDArray[np.float32]
 
-MATCAPS = ("clay", "chrome")
 # u below which a ray is given up as dark: v is 0.001 there, and steps only get smaller.
 DARK = 0.02
 
@@ -131,85 +129,6 @@ def level_set_curvature(field: Field, points: Tensor, *, level: int = -1, step: 
     return (ahead - behind).diagonal(dim1=0, dim2=2).sum(-1) / (4 * step)
 
 
-def load_matcap(name: str | Path) -> Tensor:
-    """One of `MATCAPS`, or a picture of a sphere that fills it → ``(H, W, 3)`` display RGB in [0, 1]."""
-    if str(name) in MATCAPS:
-        normals = _sphere(256)
-        return torch.from_numpy(_clay(normals) if str(name) == "clay" else _chrome(normals))
-    path = Path(name)
-    if not path.is_file():
-        raise InputError(f"matcap {path}: no such file; name a PNG or JPEG of a sphere, or one of {', '.join(MATCAPS)}")
-    data = np.frombuffer(path.read_bytes(), np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if image is None:
-        raise InputError(f"matcap {path}: cannot be read as an image; expected a PNG or JPEG of a sphere")
-    return torch.from_numpy(image[..., ::-1].astype(np.float32) / 255)
-
-
-def sample_matcap(matcap: Tensor, normals: Tensor) -> Tensor:
-    """Colours of camera-space normals ``(P, 3)`` (x right, y up, z towards the eye), bilinear.
-
-    Normals that face away take the colour of the sphere's rim.
-    """
-    across = normals[:, :2]
-    length = across.norm(dim=1, keepdim=True)
-    # So far inside the rim that no texel of the background is mixed in: √2 texels, and a little.
-    rim = 1 - 3 / min(matcap.shape[:2])
-    kept = torch.where(normals[:, 2:] > 0, length.clamp(max=rim), rim)
-    across = across * (kept / length.clamp(min=1e-6))
-    grid = torch.stack((across[:, 0], -across[:, 1]), -1)[None, :, None]  # (1, P, 1, 2)
-    texture = matcap.to(normals).movedim(-1, 0)[None]  # (1, 3, H, W)
-    found = grid_sample(texture, grid, padding_mode="border", align_corners=False)
-    return found[0, :, :, 0].T
-
-
-def _sphere(size: int) -> Float32:
-    """Normals ``(size, size, 3)`` of a sphere that fills an image; outside it, those of the rim."""
-    at = (np.arange(size, dtype=np.float32) + 0.5) / size * 2 - 1
-    x, y = np.meshgrid(at, -at)
-    radius = np.hypot(x, y)
-    shrink = np.minimum(1, 1 / np.maximum(radius, 1e-6))
-    x, y = x * shrink, y * shrink
-    z = np.sqrt(np.maximum(1 - x * x - y * y, 0))
-    return np.stack((x, y, z), -1).astype(np.float32)
-
-
-def _toward(normals: Float32, direction: tuple[float, float, float]) -> Float32:
-    """Cosine with a direction, not below 0."""
-    unit = np.asarray(direction, np.float32) / np.linalg.norm(direction).astype(np.float32)
-    return np.maximum(normals @ unit, 0)[..., None]
-
-
-def _clay(normals: Float32) -> Float32:
-    """Terracotta: a broad warm lamp from the upper left, a cool one from the right, and a dull shine."""
-    base = np.array([0.50, 0.21, 0.13], np.float32)  # linear light
-    key = _toward(normals, (-0.5, 0.7, 0.6))
-    light = (
-        np.array([0.16, 0.15, 0.16]) * (0.7 + 0.3 * normals[..., 1:2])
-        + np.array([1.05, 1.0, 0.92]) * key
-        + np.array([0.16, 0.20, 0.26]) * _toward(normals, (0.9, 0.0, 0.35))
-    )
-    shine = 0.07 * _toward(normals, (-0.28, 0.40, 0.9)) ** 24  # half-way between the lamp and the eye
-    edge = 0.06 * (1 - normals[..., 2:]) ** 3
-    return _display(base * light + shine + edge)
-
-
-def _chrome(normals: Float32) -> Float32:
-    """A mirror in a studio: a sky that pales towards the horizon, a dark floor and one soft window."""
-    mirrored = 2 * normals[..., 2:] * normals - np.array([0, 0, 1], np.float32)
-    height = mirrored[..., 1:2]
-    sky = 0.22 + 0.60 * (1 - np.clip(height, 0, 1)) ** 1.5
-    floor = 0.04 + 0.40 * np.clip(-height, 0, 1) ** 1.2
-    above = 1 / (1 + np.exp(-height * 14))
-    window = 1 / (1 + np.exp((0.90 - _toward(mirrored, (-0.5, 0.6, 0.62))) * 60))
-    tint = np.array([0.95, 0.98, 1.04]) * above + np.array([1.02, 1.0, 0.96]) * (1 - above)
-    return _display((sky * above + floor * (1 - above)) * tint + 0.7 * window)
-
-
-def _display(linear: NDArray[np.floating]) -> Float32:
-    return (linear.clip(0, 1) ** (1 / 2.2)).astype(np.float32)
-
-
 Color = tuple[float, float, float]
 
 GAMMA = 2.2  # between display values, in which images are stored, and light, which adds up
@@ -285,14 +204,13 @@ def shade(
     field: Field | None = None,
     level: int = -1,
     options: ShadeOptions | None = None,
-    matcap: Tensor | None = None,
     values: Tensor | None = None,
 ) -> Tensor:
     """Colours ``(P, 3)``, display RGB in [0, 1], of the pixels that see something.
 
-    ``level`` of ``field`` is what is seen; lamps and matcaps turn with ``camera``. ``values`` ``(P,)`` are mapped to
+    ``level`` of ``field`` is what is seen; lamps turn with ``camera``. ``values`` ``(P,)`` are mapped to
     colours if given, and else measured. Raises a ValueError for a shading that is unknown, or needs a field, colours or
-    a reference that is not there; InputError for a matcap that cannot be read.
+    a reference that is not there.
     """
     options = options or ShadeOptions()
     if shading not in SHADINGS:
@@ -310,8 +228,6 @@ def shade(
         if seen.color is None:
             raise ValueError("shading='color': the surface has no colours; shade it 'lambert'")
         return seen.color
-    if shading == "matcap":
-        return sample_matcap(load_matcap(options.matcap) if matcap is None else matcap, _view_normals(seen, camera))
     if values is None:
         values = measure(seen, shading, field=field, level=level, detail=options.detail)
     colors = apply_color_map(values, value_limits(values, shading, options), SCALES[shading])
@@ -464,12 +380,3 @@ def _cosine(seen: Seen) -> Tensor:
 
 def _facing(seen: Seen) -> Tensor:
     return _cosine(seen).abs()
-
-
-def _view_normals(seen: Seen, camera: Camera) -> Tensor:
-    """Normals ``(P, 3)`` with z towards the eye and x right: of each pixel's own view, so that rims are rims."""
-    towards = -seen.direction
-    right = torch.linalg.cross((-camera.down).to(towards).expand_as(towards), towards)
-    right = torch.nn.functional.normalize(right, dim=-1)
-    up = torch.linalg.cross(towards, right)
-    return torch.stack([(seen.normal * axis).sum(-1) for axis in (right, up, towards)], -1)

@@ -521,7 +521,6 @@ SHADINGS: dict[str, str] = {
     "raking": "clay, or the surface's own colour, under a lamp at the left that grazes what faces the camera",
     "normals": "the normal as a colour, (n + 1) / 2, in world axes",
     "depth": "distance from the camera, near light and far dark",
-    "matcap": "the picture of a lit sphere wrapped over the normals",
     "curvature": "mean curvature: hollows blue, ridges red",
     "error": "distance to a reference cloud, small pale and large dark",
     "color": "the surface's own colour, unlit",
@@ -540,7 +539,6 @@ class ShadeOptions(Settings):
     clay: tuple[float, float, float] = _share((0.80, 0.78, 0.74), "r g b of a surface without colours, in [0, 1]")
     back_faces: bool = setting(False, "tint what is seen from behind, so that holes and wrong normals show")
     detail: float = setting(4e-3, "curvature: how wide a patch it is measured on, in units of the field", above=0)
-    matcap: str = setting("clay", "clay, chrome, or a PNG or JPEG of a sphere that fills it")
     limits: tuple[float, float] | None = setting(None, "values at the ends of the colour map; none: fitted")
     quantile: float = setting(0.95, "share of pixels within fitted limits (curvature, error)", above=0, at_most=1)
     relief: float = _share(0.35, "shading of the colours of curvature and error by a headlight")

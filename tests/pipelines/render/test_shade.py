@@ -2,23 +2,19 @@
 
 import dataclasses
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from fields import FIELDS
 from mplicits.datasets.cameras import Camera, look_at
-from mplicits.neural_fields import Field, InputError, Plane, Siren, Sphere, Union
+from mplicits.neural_fields import Field, Plane, Siren, Sphere, Union
 from mplicits.pipelines.render.shade import (
     COLOR_MAPS,
-    MATCAPS,
     SHADINGS,
     ShadeOptions,
     apply_color_map,
     compose,
     downsample,
-    load_matcap,
-    sample_matcap,
     shade,
     value_limits,
 )
@@ -110,8 +106,8 @@ def test_a_raking_light_shows_a_degree():
         torch.testing.assert_close(rgb, torch.full((1, 3), float(expected)), atol=2e-5, rtol=0)
 
 
-@pytest.mark.parametrize("shading", ["lambert", "headlight", "raking", "matcap", "depth"])
-def test_lamps_and_matcaps_turn_with_the_camera(shading):
+@pytest.mark.parametrize("shading", ["lambert", "headlight", "raking", "depth"])
+def test_lamps_turn_with_the_camera(shading):
     pictures = []
     for eye in (EYE, (4.0, 0.0, 0.0), (1.2, 3.0, -2.2)):
         camera = camera_at(tuple(np.asarray(eye) / np.linalg.norm(eye) * 4))
@@ -230,50 +226,6 @@ def test_maps_are_linear_between_their_entries_and_clamped():
     backwards = apply_color_map(torch.tensor([3.0, 1.0]), (3.0, 1.0), table)
     torch.testing.assert_close(backwards, torch.tensor([[0.0, 0, 0], [1, 1, 1]]))
     assert apply_color_map(torch.ones(4), (1.0, 1.0), table).isfinite().all()
-
-
-def test_a_matcap_gives_every_normal_its_own_texel(tmp_path):
-    size = 200
-    at = (np.arange(size) + 0.5) / size
-    image = np.zeros((size, size, 3))
-    image[..., 0], image[..., 1] = at[None, :], at[:, None]  # red grows to the right, green downwards
-    path = tmp_path / "ramp.png"
-    iio.imwrite(path, (image * 255).round().astype(np.uint8))
-    seen = ball(CAMERA)
-    rgb = shade(seen, "matcap", camera=CAMERA, options=ShadeOptions(matcap=str(path)))
-    expected = 0.5 + 0.5 * seen.normal[:, :2] * torch.tensor([1.0, -1.0])
-    torch.testing.assert_close(rgb[:, :2], expected, atol=0.08, rtol=0)
-    normals = torch.tensor([[0.6, 0.0, 0.8], [0.0, -0.28, 0.96], [1.0, 0.0, 0.0], [0.6, 0.0, -0.8]])
-    found = sample_matcap(load_matcap(path), normals)[:, :2]
-    expected = torch.tensor([[0.8, 0.5], [0.5, 0.64], [0.9925, 0.5], [0.9925, 0.5]])
-    torch.testing.assert_close(found, expected, atol=0.004, rtol=0)
-
-
-def test_nothing_of_a_matcaps_background_is_mixed_in():
-    size = 64
-    at = torch.arange(size) - (size - 1) / 2
-    inside = torch.hypot(at[:, None], at[None]) < size / 2
-    angle = torch.linspace(0, 2 * torch.pi, 1000)
-    rim = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), -1)
-    assert (sample_matcap(inside[..., None].expand(-1, -1, 3).float(), rim) > 1 - 1e-5).all()
-
-
-@pytest.mark.parametrize("name", MATCAPS)
-def test_built_in_matcaps_are_lit_from_above_left(name):
-    matcap = load_matcap(name)
-    assert ((matcap >= 0) & (matcap <= 1)).all()
-    height, width, _ = matcap.shape
-    row, column = divmod(int(matcap.sum(2).argmax()), width)
-    assert (row < height / 2, column < width / 2) == (True, True)
-
-
-def test_matcaps_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match=r"nowhere\.png: no such file; .*chrome"):
-        load_matcap(tmp_path / "nowhere.png")
-    for content in (b"", b"not an image"):
-        (tmp_path / "bad.png").write_bytes(content)
-        with pytest.raises(InputError, match=r"bad\.png: cannot be read"):
-            load_matcap(tmp_path / "bad.png")
 
 
 @pytest.mark.parametrize(
