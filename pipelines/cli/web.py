@@ -28,28 +28,25 @@ def _web_arguments(parser: argparse.ArgumentParser) -> None:
     add("--force", action="store_true", help="overwrite what was not written by this command")
 
 
-def _check_folder(out: Path) -> None:
-    """Refuse a folder in which something else is than what this command writes."""
-    if out.exists() and not out.is_dir():
-        raise input_error(f"{out}: is a file; name a folder, or a file that ends with {' or '.join(PAGES)}")
+def _check_place(out: Path, *, force: bool) -> None:
+    """Refuse a file or folder in which something else is than what this command writes."""
     from ...neural_fields.backend.files import check_place
 
-    check_place(out / "index.html")
-    field = out / "field.bin"
-    ours = field.is_file() and field.read_bytes().startswith(b"mplicits-field\n")
-    if out.is_dir() and any(out.iterdir()) and not ours:
-        raise input_error(f"{out}: is not empty, and was not written by this command; name another folder")
+    page = out if out.suffix else out / "index.html"
+    if out.suffix:
+        check_output(out, PAGES)
+    elif out.exists() and not out.is_dir():
+        raise input_error(f"{out}: is a file; name a folder, or a file that ends with {' or '.join(PAGES)}")
+    else:
+        check_place(page)
+    taken = page.exists() or (out.is_dir() and any(out.iterdir()))
+    if taken and not force and not (page.is_file() and MARK in page.read_text(encoding="utf-8", errors="replace")):
+        raise input_error(f"{out}: is not empty, and no page of this command; name another place, or say --force")
 
 
 def _web(arguments: argparse.Namespace) -> int:
     out = arguments.out
-    if out.suffix:
-        check_output(out, PAGES)
-    else:
-        _check_folder(out)
-    page = out if out.suffix else out / "index.html"
-    if page.exists() and not arguments.force and MARK not in page.read_text(encoding="utf-8", errors="replace"):
-        raise input_error(f"{page}: is there, and no page of this command; name another file, or say --force")
+    _check_place(out, force=arguments.force)
     from ..web.export import WebOptions, web_run
 
     started = time.monotonic()
