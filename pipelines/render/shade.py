@@ -333,11 +333,11 @@ def _lambert(seen: Seen, camera: Camera, field: Field | None, level: int, option
         if options.occlusion:
             open_ = ambient_occlusion(field, seen.position, normal, level=where, reach=options.reach)
             key = key * (0.5 + 0.5 * open_)
-    ambient = torch.lerp(_light(LAMPS.sky_light, normal), _light(LAMPS.ground_light, normal), lower[:, None])
-    rest = torch.addcmul(ambient, fill[:, None], _light(LAMPS.fill_light, normal))
+    ambient = torch.lerp(normal.new_tensor(LAMPS.sky_light), normal.new_tensor(LAMPS.ground_light), lower[:, None])
+    rest = torch.addcmul(ambient, fill[:, None], normal.new_tensor(LAMPS.fill_light))
     if open_ is not None:
         rest = rest * open_[:, None]
-    light = torch.addcmul(rest, key[:, None], _light(LAMPS.key_light, normal))
+    light = torch.addcmul(rest, key[:, None], normal.new_tensor(LAMPS.key_light))
     return _to_display(_albedo(seen, options) * light)
 
 
@@ -358,19 +358,15 @@ def _towards_viewer(seen: Seen) -> Tensor:
 
 def _albedo(seen: Seen, options: ShadeOptions) -> Tensor:
     """What the surface reflects, in linear light: ``(P, 3)``, or ``(3,)`` where it is the same everywhere."""
-    albedo = _light(options.clay, seen.normal) if seen.color is None else seen.color
+    albedo = seen.normal.new_tensor(options.clay) if seen.color is None else seen.color
     if options.back_faces:
         behind = _cosine(seen) > LAMPS.behind
-        albedo = torch.where(behind[:, None], _light(LAMPS.back, seen.normal), albedo)
+        albedo = torch.where(behind[:, None], seen.normal.new_tensor(LAMPS.back), albedo)
     return albedo**GAMMA
 
 
 def _to_display(light: Tensor) -> Tensor:
     return light.clamp(0, 1) ** (1 / GAMMA)
-
-
-def _light(color: Color, like: Tensor) -> Tensor:
-    return torch.tensor(color, dtype=like.dtype, device=like.device)
 
 
 def _cosine(seen: Seen) -> Tensor:

@@ -166,16 +166,11 @@ class _View:
 def _each_once(
     draw: Callable[[float], Image], offsets: Float64, progress: Callable[[int, int], None] | None
 ) -> Iterator[Image]:
-    """The picture at each offset; one that comes back is kept, packed, until then instead of drawn again."""
-    keys = np.round(offsets, 9).tolist()
+    """The picture at each offset; it is kept, packed, for when the plane comes back."""
     packed: dict[float, NDArray[np.uint8]] = {}
-    for place, key in enumerate(keys):
-        if key in packed:
-            yield np.asarray(cv2.imdecode(packed[key], cv2.IMREAD_COLOR), np.uint8)
-        else:
-            image = draw(key)
-            if key in keys[place + 1 :]:
-                packed[key] = np.asarray(cv2.imencode(".png", image)[1], np.uint8)
-            yield image
+    for place, offset in enumerate(np.round(offsets, 9).tolist()):
+        if offset not in packed:
+            packed[offset] = np.asarray(cv2.imencode(".png", draw(offset))[1], np.uint8)
+        yield np.asarray(cv2.imdecode(packed[offset], cv2.IMREAD_COLOR), np.uint8)
         if progress is not None:
-            progress(place + 1, len(keys))
+            progress(place + 1, len(offsets))

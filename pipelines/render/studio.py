@@ -58,7 +58,8 @@ def photograph_mesh(
         raise InputError(f"{path}: has no faces, so there is no surface to photograph; give a mesh")
     ball = Similarity.to_unit_sphere(mesh.vertices[np.unique(mesh.faces)])
     mesh = dataclasses.replace(mesh, vertices=ball.to_unit(mesh.vertices))
-    light = {"shaded": shaded or not _has_colors(mesh), "glossy": glossy}
+    colored = mesh.has_colors if isinstance(mesh, TexturedMesh) else mesh.colors is not None
+    light = {"shaded": shaded or not colored, "glossy": glossy}
     # About as many as structure from motion would give.
     points, _ = sample_points(Mesh(mesh.vertices, mesh.faces), 1000, np.random.default_rng(seed))
     images: list[PosedImage] = []
@@ -66,7 +67,8 @@ def photograph_mesh(
     placed = cameras_around(ball.scale, up=up, views=views, size=size, seed=seed, middle=ball.center)
     for index, camera in enumerate(placed):
         near = camera.moved(ball)
-        color, mask = _photograph(mesh, near, samples, light)
+        strips = [_strip(mesh, fine, samples, light) for fine in fine_strips(near, samples, pixels=1 << 21)]
+        color, mask = (np.concatenate(part) for part in zip(*strips, strict=True))
         middles = mesh_view(mesh, near)
         observed.append(sees(near, middles, points))
         depth = DepthMap(ball.scale * _depths(near, middles), camera, "metric", Path(path)) if depths else None
@@ -101,19 +103,11 @@ def sees(camera: Camera, seen: Seen, points: Float64) -> NDArray[np.bool_]:
     return found
 
 
-def _has_colors(mesh: Painted) -> bool:
-    return mesh.has_colors if isinstance(mesh, TexturedMesh) else mesh.colors is not None
-
-
-def _photograph(mesh: Painted, camera: Camera, samples: int, light: dict[str, bool]) -> tuple[Float32, Float32]:
-    """Display RGB ``(H, W, 3)`` with straight alpha, and the mask ``(H, W)``."""
-    parts = [_strip(mesh, fine, samples, light) for fine in fine_strips(camera, samples, pixels=1 << 21)]
-    color, mask = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return color, mask
-
-
 def _strip(mesh: Painted, fine: Camera, samples: int, light: dict[str, bool]) -> tuple[Float32, Float32]:
-    """The same, of a strip whose camera has ``samples`` pixels per pixel and direction."""
+    """Display RGB ``(H, W, 3)`` with straight alpha, and the mask ``(H, W)``, of a strip of an image.
+
+    Its camera ``fine`` has ``samples`` pixels per pixel and direction.
+    """
     seen = mesh_view(mesh, fine)
     own = np.full((len(seen.pixel), 3), CLAY) if seen.color is None else seen.color.double().numpy()
     sent, mask = np.zeros((fine.height * fine.width, 3)), np.zeros(fine.height * fine.width, bool)
