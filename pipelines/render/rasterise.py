@@ -12,6 +12,7 @@ from ...datasets.cameras import Camera
 from ...datasets.clouds.readers.meshes import vertex_normals
 from ...datasets.textured.reading import TexturedMesh, colors_at, read_textured
 from ...neural_fields import InputError, Mesh
+from ..surface.distance import barycentric_of_nearest
 from ..surface.raster import clip, cover
 from ..surface.surface import read_surface
 from .picture import Image
@@ -87,19 +88,13 @@ def _near(z: Float64) -> float:
 def _visible(vertices: Float64, faces: NDArray[np.integer], camera: Camera) -> tuple[Int64, Int64, Float64]:
     """Pixels ``(P,)`` that see a face, the nearest face ``(P,)``, and weights ``(P, 3)`` of its corners in space."""
     z = camera.project(torch.from_numpy(vertices))[1].numpy()
-    cut = clip(z - _near(z), faces)
-    # Every vertex after the cut lies between two old ones: an old one, between itself and itself.
-    old, none = np.arange(len(vertices)), np.zeros(len(vertices))
-    kept, dropped = np.concatenate((old, cut.kept)), np.concatenate((old, cut.dropped))
-    share = np.concatenate((none, cut.share))[:, None]
-    pixel, part, weights = _nearest_faces((1 - share) * vertices[kept] + share * vertices[dropped], cut.faces, camera)
-    face, ends = cut.owner[part], cut.faces[part]
-    whole = np.zeros_like(weights)
-    for k in range(3):
-        there, off = ends[:, k], weights[:, k, None] * share[ends[:, k]]
-        whole += (weights[:, k, None] - off) * (faces[face] == kept[there, None])
-        whole += off * (faces[face] == dropped[there, None])
-    return pixel, face, whole
+    every, parts, owner = clip(vertices, z - _near(z), faces)
+    pixel, part, weights = _nearest_faces(every, parts, camera)
+    face, ends = owner[part], parts[part]
+    cut = (ends >= len(vertices)).any(axis=1)
+    places = (weights[cut][..., None] * every[ends[cut]]).sum(axis=1)
+    weights[cut] = barycentric_of_nearest(places, vertices[faces[face[cut]]])
+    return pixel, face, weights
 
 
 def _nearest_faces(vertices: Float64, faces: NDArray[np.integer], camera: Camera) -> tuple[Int64, Int64, Float64]:

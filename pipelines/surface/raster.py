@@ -29,27 +29,11 @@ class Coverage(NamedTuple):
     sign: NDArray[np.int8]
 
 
-class Clipped(NamedTuple):
-    """Triangles cut at a plane; vertex V + k is ``(1 − share[k]) kept[k] + share[k] dropped[k]``.
-
-    Attributes:
-        faces: ``(F', 3)`` indices of old vertices, and of new ones from V on.
-        owner: ``(F',)`` the old triangle that each is a part of.
-        kept: ``(K,)`` old vertex on the near side of the cut edge.
-        dropped: ``(K,)`` the one on the far side.
-    """
-
-    faces: Faces
-    owner: Int64
-    kept: Int64
-    dropped: Int64
-    share: Float64
-
-
-def clip(height: Float64, faces: Faces) -> Clipped:
+def clip(vertices: Float64, height: Float64, faces: Faces) -> tuple[Float64, Faces, Int64]:
     """Cut triangles where ``height`` ``(V,)``, linear over each, is zero, and keep where it is positive.
 
-    A cut quadrilateral becomes two triangles. Neighbours cut their common edge at exactly the same place.
+    Returns the vertices, old ones first; the triangles; and for each the old triangle that it is a part of. A cut
+    quadrilateral becomes two triangles. Neighbours cut their common edge at exactly the same place.
     """
     positive = height > 0
     count = positive[faces].sum(axis=1)
@@ -73,8 +57,9 @@ def clip(height: Float64, faces: Faces) -> Clipped:
             parts.extend((np.stack((ab, b, c), axis=1), np.stack((ab, c, ac), axis=1)))
             ends.append((np.concatenate((b, c)), np.concatenate((a, a))))
     kept, dropped = (np.concatenate(side) for side in zip(*ends, strict=True))
-    share = height[kept] / (height[kept] - height[dropped])
-    return Clipped(np.concatenate(parts), np.concatenate(owner), kept, dropped, share)
+    share = (height[kept] / (height[kept] - height[dropped]))[:, None]
+    made = (1 - share) * vertices[kept] + share * vertices[dropped]
+    return np.concatenate((vertices, made)), np.concatenate(parts), np.concatenate(owner)
 
 
 def cover(
