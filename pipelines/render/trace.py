@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -64,21 +64,10 @@ class Seen:
     color: Tensor | None = None
 
 
-def strips(camera: Camera, pixels: Callable[[], int]) -> Iterator[tuple[int, Camera]]:
-    """Cut a camera into strips of whole rows: the first row and the camera of each.
-
-    ``pixels`` is called before each strip and returns about how many pixels it is to have.
-    """
-    first = 0
-    while first < camera.height:
-        rows = min(max(1, pixels() // camera.width), camera.height - first)
-        yield first, camera.strip(first, rows)
-        first += rows
-
-
 def fine_strips(camera: Camera, samples: int, *, pixels: int | None = None) -> list[Camera]:
     """A camera as strips of ``pixels`` (`STRIP`) at most, each with ``samples`` pixels per pixel and direction."""
-    parts = (part for _, part in strips(camera, lambda: (pixels or STRIP) // samples**2))
+    rows = max(1, (pixels or STRIP) // samples**2 // camera.width)
+    parts = (camera.strip(first, min(rows, camera.height - first)) for first in range(0, camera.height, rows))
     return [part.resized(part.width * samples, part.height * samples) for part in parts]
 
 
