@@ -51,13 +51,8 @@ class MeshDistance:
         Unless ``certain``, the search ends after the eight pieces whose centres are nearest: a distance may be too long
         by the radius of a piece, far from the surface above all, where certainty costs much.
         """
-        if not certain:
-            nearest = np.reshape(self.tree.query(points, k=min(8, len(self.owner)), workers=-1)[1], (len(points), -1))
-            parts = np.array_split(np.arange(len(points)), 1 + nearest.size // self.pairs_at_once)
-            found = [self._nearest_of(points[part], self.owner[nearest[part]]) for part in parts]
-            return np.concatenate([signed for signed, _ in found]), np.concatenate([slope for _, slope in found])
         result, slopes = np.empty(len(points)), np.empty((len(points), 3))
-        rows, count = np.arange(len(points)), min(16, len(self.owner))
+        rows, count = np.arange(len(points)), min(16 if certain else 8, len(self.owner))
         while len(rows):
             unsure = []
             for part in np.array_split(rows, 1 + len(rows) * count // self.pairs_at_once):
@@ -66,7 +61,7 @@ class MeshDistance:
                 result[part], slopes[part] = self._nearest_of(points[part], self.owner[nearest])
                 # Every piece that was not looked at is at least this far away.
                 unsure.append(part[np.abs(result[part]) > reach[:, -1] - self.radius])
-            rows = np.concatenate(unsure) if count < len(self.owner) else rows[:0]
+            rows = np.concatenate(unsure) if certain and count < len(self.owner) else rows[:0]
             count = min(4 * count, len(self.owner))
         return result, slopes
 
