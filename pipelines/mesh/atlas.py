@@ -135,7 +135,7 @@ def _laid(vectors: Float64, normals: Float64) -> Float64:
 
 @dataclass(frozen=True)
 class Decimation:
-    """What a decimation has cost; ``largest`` and ``mean`` distance are in the units of the mesh, both ways.
+    """What a decimation has cost; ``largest`` and ``mean`` distance are those both ways.
 
     Distances from each mesh to the other are exact, at the vertices of the full mesh and at the vertices, edge
     midpoints and face centres of the other, evenly thinned to 50,000 points each way.
@@ -147,10 +147,6 @@ class Decimation:
     mean: float
     closed_before: bool
     closed: bool
-
-    def times(self, scale: float) -> Decimation:
-        """The same in other units; one of today's is ``scale`` of them."""
-        return dataclasses.replace(self, largest=self.largest * scale, mean=self.mean * scale)
 
     def describe(self, unit: str) -> str:
         """One line, for people."""
@@ -168,8 +164,11 @@ class Decimated(NamedTuple):
     cost: Decimation
 
 
-def decimated(mesh: Mesh, faces: int) -> Decimated:
-    """Collapse edges until about ``faces`` triangles are left, and measure how far that has led."""
+def decimated(mesh: Mesh, faces: int, *, unit: float = 1.0) -> Decimated:
+    """Collapse edges until about ``faces`` triangles are left, and measure how far that has led.
+
+    A unit of the mesh is ``unit`` of those in which distances are stated.
+    """
     full = Mesh(mesh.vertices, mesh.faces.astype(np.int64))
     closed = is_closed(full)
     if len(mesh.faces) <= faces:
@@ -178,7 +177,7 @@ def decimated(mesh: Mesh, faces: int) -> Decimated:
     vertices, corners = decimate(mesh.vertices, mesh.faces, faces)
     left = Mesh(vertices, corners)
     largest, mean = deviation(full, left)
-    cost = Decimation(len(mesh.faces), len(corners), largest, mean, closed, is_closed(left))
+    cost = Decimation(len(mesh.faces), len(corners), unit * largest, unit * mean, closed, is_closed(left))
     return Decimated(Mesh(vertices, corners.astype(np.int32)), cost)
 
 

@@ -201,9 +201,8 @@ def export_run(
         mesh = keep_largest(mesh)
     decimation = None
     if options.faces is not None:
-        mesh, cost = decimated(mesh, options.faces)
+        mesh, decimation = decimated(mesh, options.faces, unit=similarity.scale)
         mesh = dataclasses.replace(mesh, normals=_unit_normals(field, mesh, level=normal_level))
-        decimation = cost.times(similarity.scale)
         if say is not None:
             say(decimation.describe(options.unit or "input units"))
     colored = options.colors and file.with_name(TEXTURE_FILE).is_file()

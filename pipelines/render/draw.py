@@ -237,7 +237,9 @@ def posed_cameras(
     if film and frame is not None:
         raise InputError("--frame: a film goes through all the cameras; leave it out, or write a picture (.png)")
     chosen = named if film else [choose_frame(file, named, frame)]
-    cameras = [_scaled(camera, width).moved(similarity) for _, camera in chosen]
+    cameras = [camera.moved(similarity) for _, camera in chosen]
+    if width is not None:
+        cameras = [part.resized(width, max(1, round(part.height * width / part.width))) for part in cameras]
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:
         shown = ", ".join(f"{width}×{height}" for width, height in sizes[:3])
@@ -260,12 +262,6 @@ def choose_frame(file: str | Path, named: Sequence[tuple[str, Camera]], frame: s
     if frame.isdecimal() and int(frame) < len(named):
         return named[int(frame)]
     raise InputError(f"--frame {frame}: {file} {some}; none, or more than one, is called that")
-
-
-def _scaled(camera: Camera, width: int | None) -> Camera:
-    if width is None:
-        return camera
-    return camera.resized(width, max(1, round(camera.height * width / camera.width)))
 
 
 Color = tuple[float, float, float]
@@ -453,17 +449,12 @@ class _Artist:
             alone = len(lines) == len(lines[0]) == 1
             yield self._with_legend(lines[0][0][1] if alone else contact_sheet(*lines), alone=alone)
 
-    @property
-    def _views(self) -> str:
-        """What several cameras are called."""
-        return "sides" if self.options.sides > 1 else "frames"
-
     def caption(self, cameras: Sequence[Camera]) -> str:
         """What was drawn, in a few words."""
-        first, count = cameras[0], len(cameras)
+        first, count, several = cameras[0], len(cameras), "sides" if self.options.sides > 1 else "frames"
         what = ", ".join(panel.label for panel in self.panels)
         shading = "radiance" if self.painter else self.shading
-        words = [what, shading, f"{first.width}×{first.height}" + (f", {count} {self._views}" if count > 1 else "")]
+        words = [what, shading, f"{first.width}×{first.height}" + (f", {count} {several}" if count > 1 else "")]
         if self.shading in MEASURES and self.shade_options.limits is not None:
             low, high = (limit * self.unit for limit in self.shade_options.limits)
             words[1] += f" from {low:.4g} to {high:.4g}"
@@ -482,19 +473,16 @@ class _Artist:
         rgb = seen.position
         if len(seen.pixel):
             self.anything = True
-            rgb = self._colors(seen, camera, panel)
+            rgb = shade(
+                seen,
+                self.shading,
+                camera=camera,
+                field=self.subject.field,
+                level=panel.level,
+                options=self.shade_options,
+                values=self._measure(seen, panel) if self.shading in MEASURES else None,
+            )
         return downsample(compose(seen, rgb, background=self.options.background), self.options.samples)
-
-    def _colors(self, seen: Seen, camera: Camera, panel: Panel) -> Tensor:
-        return shade(
-            seen,
-            self.shading,
-            camera=camera,
-            field=self.subject.field,
-            level=panel.level,
-            options=self.shade_options,
-            values=self._measure(seen, panel) if self.shading in MEASURES else None,
-        )
 
     def _measure(self, seen: Seen, panel: Panel) -> Tensor:
         if not len(seen.pixel):

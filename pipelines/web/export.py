@@ -21,7 +21,7 @@ from ..render.draw import FRAME_RESOLUTION, traced_part
 from ..texture.train import texture_of
 from ..training.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from .assembly import fill_page, write_folder
-from .payload import Payload, Rounding, network_layers, rounding_error, shader_levels, taper_of
+from .payload import Payload, Rounding, network_layers, rounding_error, shader_levels
 from .shapes import Shape, add_shape, distance_cloud, field_shapes, read_shape
 from .shell import GRID, MOMENTS, shell_mesh, surface_reach, swept_shell
 
@@ -186,7 +186,7 @@ def pack_field(
         "levels": levels,
         "colors": colors,
         "deltas": deltas,
-        "taper": taper_of(stills[0]),
+        "taper": stills[0].taper if isinstance(stills[0], MultiscaleSDF) else 0.0,
         "reach": surface_reach(field) if moving is None else bands,
         "shell": {"low": low.tolist(), "high": high.tolist(), "grid": GRID, "triangles": len(shell.faces)},
         "bits": bits,

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...neural_fields import Field, MultiscaleSDF, Siren
+from ...neural_fields import Field, Siren
 from ...neural_fields.networks.multiscale import levels_of
 
 TURN = 2 * math.pi
@@ -108,11 +108,6 @@ def rounding_error(field: Field, bits: int, points: NDArray[np.floating]) -> lis
         angle = math.degrees(2 * math.asin(min(1.0, float(chord))))
         found.append(Rounding(float((before.value - after.value).abs().max()), angle))
     return found
-
-
-def taper_of(field: Field) -> float:
-    """The share of a band over which its gate closes; 0 for a field without bands."""
-    return field.taper if isinstance(field, MultiscaleSDF) else 0.0
 
 
 # What may stand in a block of data in a page: printable, and without " & <. A pair says 13 bits, as 91² > 2¹³.
