@@ -49,7 +49,7 @@ def demo(
     check_place(out)
     asked_up, up = up, up or ("z" if cloud is None else "y")
     picture = out / "picture.png"
-    drawn: list[Image] = []
+    drawn: list[tuple[str, Image]] = []  # what the picture shows side by side, with titles
     said: list[str] = []  # once the bars are gone
     with progress_bars() as report:
         # Before anything is made.
@@ -62,9 +62,13 @@ def demo(
 
         def show(field: Field, similarity: Similarity) -> None:
             """Draw the level that is finished beside those before, so that there is something to look at meanwhile."""
-            level = field.num_levels - 1
+            level, near = field.num_levels - 1, from_cloud(points).moved(similarity)
+            camera = view_of(near, up)
             with reported(report, f"level {level}: picture"):
-                write_picture(picture, draw_levels(points, field, None, similarity, up=up, drawn=drawn))
+                if not drawn:
+                    drawn.append((f"input: {len(near.vertices):,} points", picture_of(near, camera)))
+                drawn.append((f"level {level}, traced", _traced(field, camera, level)))
+                write_picture(picture, contact_sheet(drawn))
             print(f"{picture}: drawn up to level {level}", flush=True)
 
         run = fit(file, config, out=out / "run", progress=report, level_done=show)
@@ -81,7 +85,10 @@ def demo(
         for name in ("mesh.ply", "mesh.glb"):
             write_mesh(out / name, finest, run.similarity, placement if name == "mesh.glb" else None)
         mesh_count(levels, levels)
-        write_picture(picture, draw_levels(points, run.field, finest, run.similarity, up=up, drawn=drawn))
+        if finest.colors is not None:
+            camera = view_of(from_cloud(points).moved(run.similarity), up)
+            drawn.append((f"mesh: {len(finest.faces):,} faces", picture_of(finest, camera)))
+            write_picture(picture, contact_sheet(drawn))
         with reported(report, "figures"):
             said.append(_figures(run, meshes, points))
             if cloud is None:
@@ -107,28 +114,9 @@ def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity) -> Mesh
     return dataclasses.replace(mesh, colors=colors.astype(np.float32))
 
 
-def draw_levels(
-    cloud: PointCloud,
-    field: Field,
-    mesh: Mesh | None,
-    similarity: Similarity,
-    *,
-    up: str,
-    drawn: list[Image] | None = None,
-) -> Image:
-    """The cloud and each level side by side from one camera, and the mesh of the finest if it has colours.
-
-    ``drawn`` holds the pictures of levels from an earlier call; new ones are appended to it.
-    """
-    drawn = [] if drawn is None else drawn
-    points = from_cloud(cloud).moved(similarity)
-    camera = orbit(points.vertices, up=up, width=TILE[0], height=TILE[1])
-    pictures = [(f"input: {len(points.vertices):,} points", picture_of(points, camera))]
-    drawn += [_traced(field, camera, level) for level in range(len(drawn), field.num_levels)]
-    pictures += [(f"level {level}, traced", image) for level, image in enumerate(drawn)]
-    if mesh is not None and mesh.colors is not None:
-        pictures.append((f"mesh: {len(mesh.faces):,} faces", picture_of(mesh, camera)))
-    return contact_sheet(pictures)
+def view_of(points: Mesh, up: str) -> Camera:
+    """The camera of all pictures, in the coordinates of the points."""
+    return orbit(points.vertices, up=up, width=TILE[0], height=TILE[1])
 
 
 def _traced(field: Field, camera: Camera, level: int) -> Image:

@@ -24,7 +24,6 @@ from ...neural_fields.backend.kernels.switch import choose
 PACKAGE = "mplicits"
 OWN_CV2 = "opencv-contrib-python-headless"
 OTHER_CV2 = ("opencv-python", "opencv-python-headless", "opencv-contrib-python")
-DEVELOPERS = "extra == .dev"
 
 
 @dataclass(frozen=True)
@@ -41,11 +40,15 @@ class Finding:
 
 def examine(folder: Path | None = None) -> list[Finding]:
     """Check Python, packages, threads, GPU, speed, and whether ``folder`` (the current directory) can be written."""
+    # Not what developers need, nor the versions that a host has pinned, which `_cv2` judges.
+    asked = [
+        line for line in importlib.metadata.requires(PACKAGE) or [] if not re.search("extra == .dev|^[^;]*==", line)
+    ]
     python = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     return [
         Finding("ok", "Python", python),
         _start(),
-        *(_requirement(line) for line in importlib.metadata.requires(PACKAGE) or [] if _is_asked_of_users(line)),
+        *(_requirement(line) for line in asked),
         _cv2(),
         *_torchvision(),
         _threads(),
@@ -80,11 +83,6 @@ def _installed(name: str) -> str | None:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return None
-
-
-def _is_asked_of_users(requirement: str) -> bool:
-    """Not what developers need, nor the versions that a host has pinned, which `_cv2` judges."""
-    return not re.search(DEVELOPERS, requirement) and "==" not in requirement.split(";")[0]
 
 
 def _requirement(requirement: str) -> Finding:
