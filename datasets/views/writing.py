@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,6 @@ from ..cameras import Camera
 from .images import PosedImage, PosedImages
 
 Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 PINHOLE = 1  # COLMAP's number for the model with fx, fy, cx, cy
 GREY = 128  # the colour of sparse points, whose own colour is unknown
@@ -91,8 +90,8 @@ def write_transforms(folder: str | Path, images: PosedImages) -> None:
         (partial / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def write_colmap(folder: str | Path, images: PosedImages, *, form: Literal["text", "binary"] = "binary") -> None:
-    """Write ``images/`` and a sparse model in ``sparse/0``, as COLMAP writes them.
+def write_colmap(folder: str | Path, images: PosedImages) -> None:
+    """Write ``images/`` and a binary sparse model in ``sparse/0``, as COLMAP writes them.
 
     Cameras are PINHOLE, one for each distinct lens. Masks become the alpha channel (straight). Observations of sparse
     points are written at the places to which the points project.
@@ -101,103 +100,50 @@ def write_colmap(folder: str | Path, images: PosedImages, *, form: Literal["text
         InputError: the folder is not new, or cannot be written.
     """
     with _new_folder(folder, images) as partial:
-        named = list(_numbered(images))
-        for name, view in named:
+        for name, view in _numbered(images):
             _write_png(partial / "images" / name, _with_alpha(view))
-        lenses = list(dict.fromkeys(_lens(view.camera) for _, view in named))
-        number = {lens: k for k, lens in enumerate(lenses, 1)}
-        places = [(name, number[_lens(view.camera)], *_pose(view.camera)) for name, view in named]
-        points = np.empty((0, 3)) if images.points is None else images.points
         model = partial / "sparse" / "0"
         model.mkdir(parents=True)
-        {"text": _write_text, "binary": _write_binary}[form](model, lenses, places, points, _observations(images))
+        _write_model(model, images)
 
 
-_Lens = tuple[int, int, float, float, float, float]
-_Place = tuple[str, int, list[float], list[float]]
-
-
-class _Observations(NamedTuple):
-    """The sparse points that each view shows; ``(K,)`` each, view by view, numbers from 0."""
-
-    view: Int64
-    point: Int64
-    pixel: Float64  # (K, 2) in the view's image, from its corner
-    order: Int64  # number among the points of the view
-
-    def of_view(self, view: int) -> list[tuple[float, float, int]]:
-        """Places x, y in the image of a view, each with the number of the point, from 1."""
-        rows = self.view == view
-        pairs = zip(self.pixel[rows].tolist(), self.point[rows].tolist(), strict=True)
-        return [(*pixel, point + 1) for pixel, point in pairs]
-
-    def tracks(self, points: int) -> list[list[int]]:
-        """For each point the views that show it, from 1, each followed by the order there."""
-        found: list[list[int]] = [[] for _ in range(points)]
-        for view, point, order in zip(self.view.tolist(), self.point.tolist(), self.order.tolist(), strict=True):
-            found[point] += [view + 1, order]
-        return found
-
-
-def _observations(images: PosedImages) -> _Observations:
-    seen = np.empty((0, 2), np.int64) if images.observations is None else images.observations
-    view, point = seen[np.argsort(seen[:, 0], kind="stable")].T
-    pixel = np.empty((len(view), 2))
-    for number in np.unique(view):
-        rows = view == number
-        assert images.points is not None
-        pixel[rows] = images.views[number].camera.in_view(images.points[point[rows]])[0] + 0.5
-    return _Observations(view, point, pixel, np.arange(len(view)) - np.searchsorted(view, view))
-
-
-def _write_text(model: Path, lenses: list[_Lens], places: list[_Place], points: Float64, seen: _Observations) -> None:
-    cameras = [f"{k} PINHOLE {w} {h} {_words(lens)}" for k, (w, h, *lens) in enumerate(lenses, 1)]
-    images = []
-    for k, (name, lens, q, t) in enumerate(places, 1):
-        marks = " ".join(f"{x!r} {y!r} {point}" for x, y, point in seen.of_view(k - 1))
-        images.append(f"{k} {_words(q)} {_words(t)} {lens} {name}\n{marks}")
-    cloud = [
-        " ".join((f"{k} {_words(point)} {GREY} {GREY} {GREY} 0", *map(str, track)))
-        for k, (point, track) in enumerate(zip(points.tolist(), seen.tracks(len(points)), strict=True), 1)
-    ]
-    heads = {
-        "cameras": "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]",
-        "images": "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of POINTS2D[] (X Y POINT3D_ID)",
-        "points3D": "POINT3D_ID X Y Z R G B ERROR TRACK[] (IMAGE_ID POINT2D_IDX)",
-    }
-    for (name, head), lines in zip(heads.items(), (cameras, images, cloud), strict=True):
-        text = "\n".join([f"# {head}", *lines]) + "\n"
-        (model / f"{name}.txt").write_text(text, encoding="utf-8")
-
-
-def _write_binary(model: Path, lenses: list[_Lens], places: list[_Place], points: Float64, seen: _Observations) -> None:
+def _write_model(model: Path, images: PosedImages) -> None:
+    """Write the three files of a COLMAP model, in which cameras, images and points are numbered from 1."""
     count = struct.Struct("<Q").pack
+    lenses = list(dict.fromkeys(_lens(view.camera) for view in images.views))
     cameras = [struct.pack("<iiQQ4d", k, PINHOLE, *lens) for k, lens in enumerate(lenses, 1)]
-    images = []
-    for k, (name, lens, q, t) in enumerate(places, 1):
-        marks = [struct.pack("<ddq", *mark) for mark in seen.of_view(k - 1)]
-        head = struct.pack("<i7di", k, *q, *t, lens) + name.encode() + b"\0"
-        images.append(head + count(len(marks)) + b"".join(marks))
+    points = np.empty((0, 3)) if images.points is None else images.points
+    seen = np.empty((0, 2), np.int64) if images.observations is None else images.observations
+    tracks: list[list[int]] = [[] for _ in points]  # the views that show a point, each with its place among their marks
+    shots = []
+    for k, (name, view) in enumerate(_numbered(images), 1):
+        shown = seen[seen[:, 0] == k - 1, 1].tolist()
+        pixels = view.camera.in_view(points[shown])[0] + 0.5  # from the image's corner
+        marks = [struct.pack("<ddq", *pixel, point + 1) for pixel, point in zip(pixels, shown, strict=True)]
+        for place, point in enumerate(shown):
+            tracks[point] += [k, place]
+        head = struct.pack("<i7di", k, *_pose(view.camera), lenses.index(_lens(view.camera)) + 1)
+        shots.append(head + name.encode() + b"\0" + count(len(marks)) + b"".join(marks))
     cloud = [
         struct.pack("<Q3d3BdQ", k, *point, GREY, GREY, GREY, 0.0, len(track) // 2)
         + struct.pack(f"<{len(track)}I", *track)
-        for k, (point, track) in enumerate(zip(points.tolist(), seen.tracks(len(points)), strict=True), 1)
+        for k, (point, track) in enumerate(zip(points.tolist(), tracks, strict=True), 1)
     ]
-    for name, records in (("cameras", cameras), ("images", images), ("points3D", cloud)):
+    for name, records in (("cameras", cameras), ("images", shots), ("points3D", cloud)):
         (model / f"{name}.bin").write_bytes(count(len(records)) + b"".join(records))
 
 
-def _lens(camera: Camera) -> _Lens:
+def _lens(camera: Camera) -> tuple[int, int, float, float, float, float]:
     """Width, height, fx, fy, cx, cy of COLMAP, whose first pixel has its centre at (0.5, 0.5)."""
     fx, fy, cx, cy = camera.fx_fy_cx_cy
     return camera.width, camera.height, fx, fy, cx + 0.5, cy + 0.5
 
 
-def _pose(camera: Camera) -> tuple[list[float], list[float]]:
+def _pose(camera: Camera) -> list[float]:
     """Quaternion w, x, y, z and translation of COLMAP, from the world to the camera."""
     camera_from_world = np.linalg.inv(camera.world_from_camera.numpy())
     x, y, z, w = Rotation.from_matrix(camera_from_world[:3, :3]).as_quat(canonical=True).tolist()
-    return [w, x, y, z], camera_from_world[:3, 3].tolist()
+    return [w, x, y, z, *camera_from_world[:3, 3].tolist()]
 
 
 def _projection(camera: Camera) -> Float64:
@@ -205,10 +151,6 @@ def _projection(camera: Camera) -> Float64:
     calibration = np.eye(4)
     calibration[:3, :3] = camera.intrinsics.numpy()
     return calibration @ np.linalg.inv(camera.world_from_camera.numpy())
-
-
-def _words(numbers: list[float]) -> str:
-    return " ".join(repr(number) for number in numbers)  # the shortest text that reads back as the same number
 
 
 def _numbered(images: PosedImages) -> Iterator[tuple[str, PosedImage]]:

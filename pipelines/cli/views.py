@@ -142,14 +142,14 @@ CHECK_CAMERAS = Command(
 
 
 SCENE_NAMES = ("painted-sphere", "striped-torus", "figure", "statue", "corner")
-FORMATS = ("neus", "transforms", "colmap", "colmap-text")
+FORMATS = ("neus", "transforms", "colmap")
 
 
 def _scene_arguments(parser: argparse.ArgumentParser) -> None:
     what = f"{', '.join(SCENE_NAMES)}; or a mesh, with its texture if an OBJ or glTF file has one"
     parser.add_argument("name", metavar="NAME|MESH", help=what)
     add_flags(parser, "--out", metavar="DIR", help="a folder that is not there yet")
-    what = "neus (cameras_sphere.npz), transforms (.json of nerfstudio), colmap or colmap-text (neus)"
+    what = "neus (cameras_sphere.npz), transforms (.json of nerfstudio), or colmap (neus)"
     parser.add_argument("--format", choices=FORMATS, default="neus", metavar="FORMAT", help=what)
     parser.add_argument("--views", type=whole(1, 10_000), default=24, metavar="N", help="how many images (24)")
     what = "images of N × N pixels, or of W × H (64)"
@@ -186,8 +186,7 @@ def _scene(arguments: argparse.Namespace) -> int:
             truth, images = scene_mesh(scene), render_scene(scene, **given)
         else:
             truth, images = true_mesh(name), photograph_mesh(name, up=arguments.up or "y", **given)
-    text = partial(write_colmap, form="text")
-    writers = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap, "colmap-text": text}
+    writers = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}
     writers[arguments.format](folder, images)
     write_mesh(folder / "surface.ply", truth)
     width, height = arguments.size

@@ -12,6 +12,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+import pycolmap
 import torch
 from mplicits import datasets
 from mplicits.neural_fields import MultiscaleSDF, Siren, load_field, save_field
@@ -153,13 +154,21 @@ def _meshes(folder: Path) -> Iterator[Specimen]:
     yield Specimen("described.glb", glb.read_bytes(), datasets.read_textured, damage=_within_glb)
 
 
+def _write_colmap_text(folder: Path, images: datasets.PosedImages) -> None:
+    datasets.write_colmap(folder, images)
+    model = folder / "sparse" / "0"
+    pycolmap.Reconstruction(model).write_text(model)
+    for file in model.glob("*.bin"):
+        file.unlink()
+
+
 def _views(folder: Path) -> Iterator[Specimen]:
     images = datasets.render_scene(datasets.SCENES["painted-sphere"](), 2, 12, samples=1)
     for name, write, chosen in (
         ("neus", datasets.write_neus, ("cameras_sphere.npz",)),
         ("transforms", datasets.write_transforms, ("transforms.json",)),
         ("binary", datasets.write_colmap, ("cameras.bin", "images.bin", "points3D.bin")),
-        ("text", lambda f, i: datasets.write_colmap(f, i, form="text"), ("cameras.txt", "images.txt", "points3D.txt")),
+        ("text", _write_colmap_text, ("cameras.txt", "images.txt", "points3D.txt")),
     ):
         write(folder / name, images)
         files = {p.relative_to(folder / name).as_posix(): p.read_bytes() for p in (folder / name).rglob("*.*")}

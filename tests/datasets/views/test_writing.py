@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -41,12 +40,7 @@ def photographs() -> PosedImages:
     return PosedImages(views, Similarity(CENTER, SCALE), "made up", points, Path("nowhere"))
 
 
-WRITERS = {
-    "neus": write_neus,
-    "transforms": write_transforms,
-    "colmap": write_colmap,
-    "colmap-text": partial(write_colmap, form="text"),
-}
+WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}
 
 
 def bytes_of(values) -> np.ndarray:
@@ -81,30 +75,28 @@ def test_what_is_read_is_what_was_written(tmp_path, photographs, name):
         assert np.array_equal(bytes_of(view.mask), bytes_of(mask))
     assert np.allclose(read.similarity.center, CENTER, atol=1e-9)
     assert read.similarity.scale == pytest.approx(SCALE, rel=1e-9)
-    assert np.array_equal(read.points, photographs.points) if name.startswith("colmap") else read.points is None
+    assert np.array_equal(read.points, photographs.points) if name == "colmap" else read.points is None
 
 
-@pytest.mark.parametrize("form", ["text", "binary"])
-def test_colmap_says_which_views_saw_a_point_and_where(tmp_path, form):
+def test_colmap_says_which_views_saw_a_point_and_where(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
     images = render_scene(SCENES["painted-sphere"](), 5, 16, samples=1)
     images = replace(images, observations=images.observations[::7])
-    write_colmap(tmp_path / "colmap", images, form=form)
+    write_colmap(tmp_path / "colmap", images)
     read = read_posed_images(tmp_path / "colmap")
     order = np.lexsort(read.observations.T)
     expected = images.observations[np.lexsort(images.observations.T)]
     assert np.array_equal(read.observations[order], expected)
-    if form == "text":
-        lines = (tmp_path / "colmap" / "sparse" / "0" / "images.txt").read_text().splitlines()[1:]
-        cloud = (tmp_path / "colmap" / "sparse" / "0" / "points3D.txt").read_text().splitlines()[1:]
-        for number, view in enumerate(images.views):
-            marks = np.array(lines[2 * number + 1].split(), float).reshape(-1, 3)
-            seen = images.observations[images.observations[:, 0] == number, 1]
-            assert np.array_equal(marks[:, 2], seen + 1)
-            pixels, _ = view.camera.project(torch.from_numpy(images.points[seen]))
-            assert np.abs(marks[:, :2] - 0.5 - pixels.numpy()).max() < 1e-9
-            for place, point in enumerate(seen):  # and each point leads back to its place
-                track = np.array(cloud[point].split()[8:], int).reshape(-1, 2).tolist()
-                assert [number + 1, place] in track
+    model = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0")
+    for number, view in enumerate(images.views):
+        marks = model.images[number + 1].points2D
+        seen = images.observations[images.observations[:, 0] == number, 1]
+        assert [mark.point3D_id for mark in marks] == (seen + 1).tolist()
+        pixels, _ = view.camera.project(torch.from_numpy(images.points[seen]))
+        assert np.abs(np.array([mark.xy for mark in marks]) - 0.5 - pixels.numpy()).max() < 1e-9
+        for place, point in enumerate(seen):  # and each point leads back to its place
+            track = [(element.image_id, element.point2D_idx) for element in model.points3D[point + 1].track.elements]
+            assert (number + 1, place) in track
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -125,7 +117,7 @@ def test_pictures_without_masks_have_no_alpha(tmp_path, photographs):
     bare = PosedImages((photograph(0, masked=False),), photographs.similarity, "", None, Path())
     for name, picture in (
         ("transforms", "images/000.png"),
-        ("colmap-text", "images/000.png"),
+        ("colmap", "images/000.png"),
         ("neus", "mask/000.png"),
     ):
         WRITERS[name](tmp_path / name, bare)

@@ -328,7 +328,7 @@ def test_mistakes_end_in_one_line(tmp_path, capsys, good, words, message):
     assert message in error
 
 
-@pytest.mark.parametrize("form", ["transforms", pytest.param("colmap-text", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("form", ["transforms", pytest.param("colmap", marks=pytest.mark.slow)])
 def test_scenes_come_with_their_truth(tmp_path, capsys, form):
     assert set(SCENE_NAMES) == set(SCENES)
     folder = tmp_path / "scene"
