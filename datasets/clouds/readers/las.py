@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ....neural_fields import InputError
 from ...files import MODEST
 from ..point_cloud import PointCloud, colors_from
-from .columns import CloudStream, Layout, RawRows, Table, describe_layout, named_layout
+from .columns import CloudStream, RawRows, Table, describe_layout, named_layout
 
 # Of the public header (LAS 1.4 R15, 2.4): version, sizes, how many records and points; the last part is of 1.4 alone.
 _VERSION = struct.Struct("<BB"), 24
@@ -29,80 +29,60 @@ class LasStream(CloudStream):
     """A LAS or LAZ file, read in pieces, without the points that are marked as withheld.
 
     ``columns`` are refused, since LAS files name them; ``drop_noise`` leaves out the classes for noise (7 and 18).
+    ``whole`` reads the file once, and gives one piece.
     """
 
-    def __init__(self, path: Path, columns: str | None = None, *, drop_noise: bool = False) -> None:
-        self.path, self.source, self.laspy = path, str(path), _laspy(path, columns)
-        self.choice = _Choice(path, drop_noise)
+    def __init__(
+        self, path: Path, columns: str | None = None, *, drop_noise: bool = False, whole: bool = False
+    ) -> None:
+        self.path, self.source, self.laspy, self.drop_noise = path, str(path), _laspy(path, columns), drop_noise
+        withheld, noise, colored = 0, 0, False
         with _reading(path), self.laspy.open(path) as reader:
             self.count = int(reader.header.point_count)
-            for part in reader.chunk_iterator(1 << 20):
-                self.choice.look(part)
-        self.reading = self.choice.reading()
+            self.names = ["x", "y", "z", *(n for n in reader.header.point_format.dimension_names if n not in "XYZ")]
+            self.all: list[Any] = [reader.read()] if whole else []
+            for part in self.all or reader.chunk_iterator(1 << 20):
+                withheld += int(np.count_nonzero(part.withheld))
+                noise += int(np.count_nonzero(_is_noise(part)))
+                # Without any colours, writers fill the columns with 0.
+                colored = colored or (
+                    "red" in self.names and bool(part.red.any() or part.green.any() or part.blue.any())
+                )
+        layout = named_layout(self.names)
+        assert layout is not None, "x, y and z are always there"
+        self.layout = layout if colored else layout._replace(colors=None)
+        classes = f"{noise:,} of noise classes {'left out' if drop_noise else 'kept (--drop-noise)'}"
+        notes = [f"{withheld:,} withheld points left out"] * (withheld > 0) + [classes] * (noise > 0)
+        table = Table(path, [np.empty(0)] * len(self.names), self.names, notes=tuple(notes))
+        self.reading = describe_layout(table, self.layout, self.count - withheld - (noise if drop_noise else 0))
 
     def pieces(self, rows: int) -> Iterator[RawRows]:
         """See `CloudStream.pieces`."""
         with _reading(self.path), self.laspy.open(self.path) as reader:
-            for part in reader.chunk_iterator(rows):
-                yield self.choice.rows(part)
+            for part in self.all or reader.chunk_iterator(rows):
+                yield self._rows(part)
+
+    def _rows(self, part: Any) -> RawRows:
+        """The points of one piece that are read."""
+        kept = np.asarray(part.withheld) == 0
+        if self.drop_noise:
+            kept &= ~_is_noise(part)
+        used = {k for which in self.layout if which is not None for k in which}
+        columns = [np.asarray(part[name])[kept] if k in used else np.empty(0) for k, name in enumerate(self.names)]
+        return Table(self.path, columns).rows(self.layout)
+
+
+def _is_noise(part: Any) -> NDArray[np.bool_]:
+    return np.isin(np.asarray(part.classification), (7, 18)) & (np.asarray(part.withheld) == 0)
 
 
 def read_las(path: Path, columns: str | None = None, *, drop_noise: bool = False) -> PointCloud:
     """The points but for withheld ones, with colours and normals if there are any; noise goes with `--drop-noise`."""
-    laspy, choice = _laspy(path, columns), _Choice(path, drop_noise)
-    with _reading(path):
-        las = laspy.read(path)
-        choice.look(las)
-        points, normals, colors = choice.rows(las)
+    stream = LasStream(path, columns, drop_noise=drop_noise, whole=True)
+    points, normals, colors = next(stream.pieces(stream.count))
     normals = None if normals is None else normals.astype(np.float32)
     colors = None if colors is None else colors_from(colors)
-    return PointCloud(points, normals, colors, str(path), reading=choice.reading())
-
-
-class _Choice:
-    """Which points and columns of a file are read, and how many points are not."""
-
-    def __init__(self, path: Path, drop_noise: bool) -> None:
-        self.path, self.drop_noise = path, drop_noise
-        self.names = ["x", "y", "z"]
-        self.points = self.withheld = self.noise = 0
-        self.colored = False
-
-    def look(self, part: Any) -> None:
-        """Count the points left out, and check for colours: without any, writers fill the columns with 0."""
-        self.names = ["x", "y", "z", *(name for name in part.point_format.dimension_names if name not in "XYZ")]
-        self.points += len(part)
-        self.withheld += int(np.count_nonzero(part.withheld))
-        self.noise += int(np.count_nonzero(self._is_noise(part)))
-        self.colored = self.colored or (
-            "red" in self.names and bool(np.any(part.red) or np.any(part.green) or np.any(part.blue))
-        )
-
-    def rows(self, part: Any) -> RawRows:
-        """The points of one piece that are read."""
-        kept = np.asarray(part.withheld) == 0
-        if self.drop_noise:
-            kept &= ~self._is_noise(part)
-        layout = self._layout()
-        used = {k for which in layout if which is not None for k in which}
-        columns = [np.asarray(part[name])[kept] if k in used else np.empty(0) for k, name in enumerate(self.names)]
-        return Table(self.path, columns).rows(layout)
-
-    def reading(self) -> str:
-        """See `PointCloud`."""
-        noise = f"{self.noise:,} of noise classes {'left out' if self.drop_noise else 'kept (--drop-noise)'}"
-        notes = [f"{self.withheld:,} withheld points left out"] * (self.withheld > 0) + [noise] * (self.noise > 0)
-        table = Table(self.path, [np.empty(0)] * len(self.names), self.names, notes=tuple(notes))
-        count = self.points - self.withheld - (self.noise if self.drop_noise else 0)
-        return describe_layout(table, self._layout(), count)
-
-    def _layout(self) -> Layout:
-        layout = named_layout(self.names)
-        assert layout is not None, "x, y and z are always there"
-        return layout if self.colored else layout._replace(colors=None)
-
-    def _is_noise(self, part: Any) -> NDArray[np.bool_]:
-        return np.isin(np.asarray(part.classification), (7, 18)) & (np.asarray(part.withheld) == 0)
+    return PointCloud(points, normals, colors, str(path), reading=stream.reading)
 
 
 def _check_sizes(path: Path) -> None:
