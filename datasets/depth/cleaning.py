@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...neural_fields import InputError
+
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -155,36 +157,14 @@ def smooth_depth(
         guide[..., 2] = (red - blue) / contrast
     inverse = np.where(known, 1 / relative, 0.0).astype(np.float32)
     size, spread = 2 * radius + 1, radius / 1.5
-    # Other packages may install a build of OpenCV without its contributed modules over ours.
-    blend = cv2.ximgproc.jointBilateralFilter if hasattr(cv2, "ximgproc") else joint_bilateral
+    if not hasattr(cv2, "ximgproc"):
+        fix = "pip install --force-reinstall opencv-contrib-python-headless, or --smooth-depth 0"
+        raise InputError(f"cv2: another package has replaced OpenCV by a build without its contributed modules; {fix}")
+    blend = cv2.ximgproc.jointBilateralFilter
     weights = blend(guide, known.astype(np.float32), size, 1.0, spread)
     total = blend(guide, inverse, size, 1.0, spread)
     usable = known & (total > 0)
     return np.divide(scale * weights, total, out=np.full(depth.shape, np.nan), where=usable)
-
-
-def joint_bilateral(
-    guide: NDArray[np.float32], image: NDArray[np.float32], size: int, spread: float, reach: float
-) -> NDArray[np.float32]:
-    """OpenCV's ``ximgproc.jointBilateralFilter``, with a ``guide`` ``(H, W, C)`` and mirrored edges.
-
-    A pixel q at distance |q − p| ≤ size / 2 counts exp(−‖g(q) − g(p)‖₁² / (2 spread²) − |q − p|² / (2 reach²)).
-    """
-    radius, (rows, columns) = size // 2, image.shape
-    near = np.pad(guide, ((radius, radius), (radius, radius), (0, 0)), mode="reflect")
-    values = np.pad(image, radius, mode="reflect")
-    total, weights = np.zeros_like(image), np.zeros_like(image)
-    for down in range(size):
-        for right in range(size):
-            away = (down - radius) ** 2 + (right - radius) ** 2
-            if away > radius**2:
-                continue
-            part = slice(down, down + rows), slice(right, right + columns)
-            apart = np.abs(near[part] - guide).sum(axis=2)
-            weight = np.exp(-(apart**2) / (2 * spread**2) - away / (2 * reach**2)).astype(np.float32)
-            total += weight * values[part]
-            weights += weight
-    return total / weights
 
 
 def grid_normals(points: Float64, *, pixel_angle: float, jump: float = 0.01, radius: int = 0) -> Float64:
