@@ -25,6 +25,7 @@ Float64 = NDArray[np.float64]
 UP_AXES: Mapping[str, tuple[float, float, float]] = MappingProxyType({"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)})
 """The names of the axes that may point up, and their directions."""
 
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's axes (x right, y up, z backward) to OpenCV's, and back
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of OpenCV's distortion, in its order
 UNDISTORTION = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)  # OpenCV's own five steps leave 1e-3
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in
-from ..cameras import Camera
+from ..cameras import OPENGL, Camera
 from ..files import decoded, read_json, readable, reader
 from ..views.images import read_shots
 from .camera import DepthCamera, read_intrinsics
@@ -130,7 +130,6 @@ def read_poses(path: str | Path) -> list[PosedFrame]:
 
 
 _EXPECTED = "no poses in it; expected a trajectory.log, TUM's poses, a transforms.json, or a folder of 4 × 4 matrices"
-_OPENGL = np.diag([1.0, -1, -1, 1])  # x right, y up, z backward: the axes of ARKit and OpenGL
 
 
 def _file_poses(path: Path) -> list[PosedFrame]:
@@ -176,14 +175,14 @@ def _json_poses(path: Path) -> list[PosedFrame]:
     found: list[PosedFrame] = []
     if "t_00" in content:  # Polycam
         rows = [[content.get(f"t_{i}{j}") for j in range(4)] for i in range(3)]
-        found.append((path.stem, _rigid(rows, f"{path}: t_00", _OPENGL), read_intrinsics(path)))
+        found.append((path.stem, _rigid(rows, f"{path}: t_00", OPENGL), read_intrinsics(path)))
     elif isinstance(content.get("poses"), list):  # Record3D; its lens is that of the pictures
         for index, pose in enumerate(content["poses"]):
             named = f"{path}: poses[{index}]"
             numbers = pose if isinstance(pose, list) and len(pose) == 7 else []
             if not all(isinstance(x, int | float) for x in numbers) or not numbers:
                 raise InputError(f"{named}: expected qx, qy, qz, qw, tx, ty, tz")
-            found.append((f"{index}", _rigid(_from_quaternion(numbers[4:], numbers[:4]), named, _OPENGL), None))
+            found.append((f"{index}", _rigid(_from_quaternion(numbers[4:], numbers[:4]), named, OPENGL), None))
     else:  # Open3D: from world to camera, by columns
         for index, item in enumerate(content.get("parameters", [content])):
             extrinsic = item.get("extrinsic") if isinstance(item, dict) else None

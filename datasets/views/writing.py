@@ -21,14 +21,13 @@ from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
 from ...neural_fields.backend.files import check_place
-from ..cameras import Camera
+from ..cameras import OPENGL, Camera
 from .images import PosedImage, PosedImages
 
 Float64 = NDArray[np.float64]
 
 PINHOLE = 1  # COLMAP's number for the model with fx, fy, cx, cy
 GREY = 128  # the colour of sparse points, whose own colour is unknown
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's axes (y up, z backward) to OpenCV's, and back
 
 
 def check_new_folder(path: str | Path) -> Path:

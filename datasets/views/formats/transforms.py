@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ....neural_fields import InputError
-from ...cameras import COEFFICIENTS, Camera, intrinsics
+from ...cameras import COEFFICIENTS, OPENGL, Camera, intrinsics
 from ...files import finite_number, read_json
 from .shots import IMAGE_SUFFIXES, Shot, image_size
 
@@ -115,8 +115,6 @@ def _file_name(frame: _Frame, key: str) -> str | None:
 
 
 def _camera(frame: _Frame, image: Path) -> Camera | None:
-    from kornia.geometry.conversions import camtoworld_graphics_to_vision_4x4  # here: it takes a fifth of a second
-
     lens = frame.get("camera_model")
     unknown = lens is not None and str(lens).upper() not in LENSES
     foreign = {"camera_model": unknown, "is_fisheye": frame.get("is_fisheye")}
@@ -138,9 +136,8 @@ def _camera(frame: _Frame, image: Path) -> Camera | None:
     pose = _matrix(frame.own["transform_matrix"], named)
     if pose is None:
         return None
-    turned = camtoworld_graphics_to_vision_4x4(torch.from_numpy(pose)[None])[0]
     matrix = intrinsics(fx, fx if fy is None else fy, cx - 0.5, cy - 0.5)
-    return Camera(matrix, turned, width, height, _distortion(frame))
+    return Camera(matrix, torch.from_numpy(pose @ OPENGL), width, height, _distortion(frame))
 
 
 def _distortion(frame: _Frame) -> tuple[float, ...]:
