@@ -47,7 +47,7 @@ _MOVED = {
     "shape": "Closest WorldHits in_one_frame",
     "spacetime.evolution": "Law curvature key_loss law_loss mean_curvature morph near_surface normal_speed transport",
     "spacetime.field": "SpaceTimeJet spacetime_jet",
-    "spacetime.flow": "IntegrationError Solver Tracks flow_jacobian track trajectories",
+    "spacetime.flow": "IntegrationError Solver trajectories",
     "spacetime.moving": "Keyframes ShrinkingSphere",
     "spacetime.velocity": "CarriedKeyframes Velocity VelocityJet VelocitySiren",
     "tracing.cones": "cone_starts",

@@ -1,7 +1,7 @@
-"""Points carried by vector fields and by moving surfaces: ordinary differential equations, solved by torchdiffeq.
+"""Points carried by vector fields: ordinary differential equations, solved by torchdiffeq.
 
-- `flow` follows dx/dt = V(x, t). A field carried by V keeps its value along that path, f(x(t), t) = f(x(0), 0).
-- `track` follows a point of a moving surface along its normal, dx/dt = −∂f/∂t ∇f / |∇f|².
+`flow` follows dx/dt = V(x, t). A field carried by V keeps its value along that path, f(x(t), t) = f(x(0), 0). The
+points of a moving surface follow its `CarriedVelocity`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from ..backend.errors import at_least, positive
-from ..fields.field import Field
-from ..tracing.sphere import project_to_surface
 from .evolution import VectorField
-from .field import TimeSlice, at_time
 
 ADAPTIVE = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
 FIXED = ("rk4", "heun3", "heun2", "midpoint", "euler")
@@ -72,18 +69,6 @@ class Solver:
             raise ValueError(f"method={self.method!r}: expected one of {', '.join(ADAPTIVE + FIXED)}")
         positive(rtol=self.rtol, atol=self.atol, step=self.step, max_steps=self.max_steps)
         at_least(0, min_step=self.min_step)
-
-
-class Tracks(NamedTuple):
-    """Points that followed a surface.
-
-    Attributes:
-        points: ``(T, N, 3)`` at each time.
-        distance: ``(T, N)`` |f| / |∇f| there, about how far from the surface; after the projection if there was one.
-    """
-
-    points: Tensor
-    distance: Tensor
 
 
 def flow(
@@ -152,26 +137,6 @@ class Velocity(Protocol):
         ...
 
 
-def flow_jacobian(
-    velocity: Velocity, points: Tensor, start: Tensor | float, end: Tensor | float, *, solver: Solver | None = None
-) -> tuple[Tensor, Tensor]:
-    """`flow` with the Jacobian M = ∂φ/∂x of the map φ from ``start`` to ``end``: points ``(N, 3)`` and M ``(N, 3, 3)``.
-
-    Both are integrated together: dM/dt = ∂V/∂x M, M = I at first (the equation of variation). det M is the growth of
-    volume; Mᵀ∇f is the gradient of f∘φ. Tolerances hold for the entries of M too.
-    """
-    _check_points(points)
-    start, end = _ends(points, start, end)
-
-    def both(state: Tensor, t: Tensor) -> Tensor:
-        value, jacobian, _ = velocity.jet(state[:, :3], t)
-        return torch.cat((value, (jacobian @ state[:, 3:].reshape(-1, 3, 3)).flatten(1)), dim=1)
-
-    identity = torch.eye(3, dtype=points.dtype, device=points.device).reshape(1, 9).expand(len(points), -1)
-    moved = integrate_rows(both, torch.cat((points, identity), dim=1), start, end, solver or Solver())
-    return moved[:, :3], moved[:, 3:].reshape(-1, 3, 3)
-
-
 def trajectories(
     velocity: VectorField, points: Tensor, times: Sequence[float] | Tensor, *, solver: Solver | None = None
 ) -> Tensor:
@@ -185,63 +150,6 @@ def trajectories(
     for start, end in itertools.pairwise(moments):
         path.append(integrate_rows(velocity, path[-1], start, end, solver or Solver()))
     return torch.stack(path)
-
-
-def track(
-    field: Field,
-    points: Tensor,
-    times: Sequence[float] | Tensor,
-    *,
-    level: int = -1,
-    project: bool = True,
-    least_slope: float = 0.1,
-    solver: Solver | None = None,
-) -> Tracks:
-    """Follow points of a moving surface by its normal velocity, dx/dt = −∂f/∂t ∇f / |∇f|²; errors are those of `flow`.
-
-    The velocity has no part along the surface: a turning sphere leaves its points where they are.
-
-    Args:
-        field: four-dimensional.
-        points: ``(N, 3)``, on the surface at ``times[0]``.
-        times: increasing or decreasing, ``(T,)``.
-        level: whose surface.
-        project: after each time, move the points along ∇f back to the surface, so that errors do not add up. No
-            gradients flow through a projection.
-        least_slope: lower bound on |∇f|, which bounds the velocity where a surface is torn or vanishes.
-        solver: the method, its tolerances and its limits.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields.spacetime.flow import track
-        >>> from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
-        >>> tracks = track(ShrinkingSphere(radius=0.8, alpha=0.12), torch.tensor([[0.8, 0.0, 0.0]]), [0.0, 0.5, 1.0])
-        >>> [round(float(x), 4) for x in tracks.points[:, 0, 0]]
-        [0.8, 0.6325, 0.4]
-    """
-    _check_points(points)
-    moments = _moments(times, points)
-    velocity = _NormalVelocity(field, level, least_slope)
-    path = [points]
-    for start, end in itertools.pairwise(moments):
-        moved = integrate_rows(velocity, path[-1], start, end, solver or Solver())
-        path.append(project_to_surface(TimeSlice(field, end), moved, level=level)[0] if project else moved)
-    walked = torch.stack(path)
-    value, gradient, _ = field.jet(at_time(walked, moments[:, None]), level=level)
-    return Tracks(walked, value.abs() / gradient[..., :3].norm(dim=-1).clamp(min=least_slope))
-
-
-class _NormalVelocity(nn.Module):
-    """−∂f/∂t ∇f / |∇f|²; a module, so that the adjoint finds the parameters of the field."""
-
-    def __init__(self, field: Field, level: int, least_slope: float) -> None:
-        super().__init__()
-        self.field, self.level, self.least_slope = field, level, least_slope
-
-    def forward(self, x: Tensor, t: Tensor) -> Tensor:
-        gradient = self.field.jet(at_time(x, t), level=self.level).gradient
-        space, rate = gradient[..., :3], gradient[..., 3:]
-        return -rate * space / space.square().sum(dim=-1, keepdim=True).clamp(min=self.least_slope**2)
 
 
 class _GaveUpError(Exception):

@@ -1,8 +1,8 @@
 """A velocity for the points of a moving surface: the best motion of the whole shape, and the rest along the normal.
 
-A level set defines only the normal speed v_n = −∂f/∂t / |∇f| of its points; by that alone (see `track`) the points of a
-travelling ball slide to its rear. This takes the motion u(x) = a + b × x + c x (travel, turn and growth) that explains
-the normal speeds best,
+A level set defines only the normal speed v_n = −∂f/∂t / |∇f| of its points; by that alone the points of a travelling
+ball slide to its rear. This takes the motion u(x) = a + b × x + c x (travel, turn and growth) that explains the normal
+speeds best,
 
     min over a, b, c of Σ (⟨n, u(x)⟩ − v_n(x))²  over points of the surface,   V = u + (v_n − ⟨n, u⟩) n.
 """

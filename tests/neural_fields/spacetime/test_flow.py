@@ -1,13 +1,12 @@
-"""Flows and tracks against closed forms, and failures that say how far they came."""
+"""Flows against closed forms, and failures that say how far they came."""
 
 import math
 
 import pytest
 import torch
-from fields import SCREW, small_spacetime
-from mplicits.neural_fields import Moving, RigidMotion, Siren, Sphere, flow
-from mplicits.neural_fields.spacetime.flow import IntegrationError, Solver, track, trajectories
-from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
+from fields import SCREW
+from mplicits.neural_fields import flow
+from mplicits.neural_fields.spacetime.flow import IntegrationError, Solver, trajectories
 from torch import Tensor, nn
 
 STRICT = Solver(rtol=1e-9, atol=1e-10)
@@ -77,36 +76,6 @@ def test_trajectories() -> None:
         torch.testing.assert_close(path[index], SCREW.forward(x, time), rtol=0, atol=1e-7)
 
 
-def test_points_of_a_shrinking_sphere_go_straight_to_its_centre() -> None:
-    field = ShrinkingSphere(radius=0.8, alpha=0.12)
-    x = sphere_points(100, 0.8)
-    times = [0.0, 0.25, 0.5, 1.0]
-    for project in (False, True):
-        tracks = track(field, x, times, project=project, solver=Solver(rtol=1e-8, atol=1e-9))
-        radii = field.radius_at(torch.tensor(times, dtype=torch.float64))
-        torch.testing.assert_close(tracks.points, x * (radii / 0.8)[:, None, None], rtol=0, atol=1e-6)
-        assert float(tracks.distance.max()) < 1e-6
-    back = track(field, tracks.points[-1], times[::-1], solver=STRICT)
-    torch.testing.assert_close(back.points[-1], x, rtol=0, atol=1e-6)
-
-
-def test_a_turning_sphere_leaves_its_points_where_they_are() -> None:
-    x = sphere_points(20, 0.5)
-    tracks = track(Moving(Sphere(radius=0.5), RigidMotion(angle=3.0)), x, [0.0, 1.0])
-    torch.testing.assert_close(tracks.points[-1], x, rtol=0, atol=1e-12)
-
-
-def test_points_of_a_translating_sphere_slide_as_the_closed_form_says() -> None:
-    """With n the normal of a point, n′ = −(v − ⟨v, n⟩n)/r: tan(θ/2) grows as e^{|v|t/r}, θ its angle from v."""
-    field = Moving(Sphere(radius=0.5), RigidMotion(velocity=(0.0, 0.0, 0.6)))
-    x = sphere_points(100, 0.5)
-    moved = track(field, x, [0.0, 1.0], solver=Solver(rtol=1e-9, atol=1e-10)).points[-1]
-    normal = (moved - moved.new_tensor([0.0, 0.0, 0.6])) / 0.5
-    half = (x[:, 2] / 0.5).acos() / 2
-    expected = 2 * (half.tan() * math.exp(0.6 / 0.5)).atan()
-    torch.testing.assert_close(normal[:, 2].clamp(-1, 1).acos(), expected, rtol=0, atol=1e-6)
-
-
 class Swirl(nn.Module):
     """dx/dt = a x, so x(1) = e^a x(0)."""
 
@@ -126,17 +95,6 @@ def test_gradients_of_a_flow(adjoint: bool, method: str) -> None:
     flow(swirl, x, 0.0, 1.0, solver=solver).sum().backward()
     torch.testing.assert_close(x.grad, torch.full_like(x, math.exp(0.3)), rtol=0, atol=1e-6)
     torch.testing.assert_close(swirl.a.grad, math.exp(0.3) * x.detach().sum(), rtol=0, atol=1e-6)
-
-
-def test_the_adjoint_of_a_track_reaches_the_field() -> None:
-    field = Siren(16, 2, omega=3.0, in_dim=4).double()
-    x = torch.rand(8, 3, dtype=torch.float64)
-    gradients = []
-    for adjoint in (False, True):
-        solver = Solver(method="rk4", step=0.02, adjoint=adjoint)
-        loss = track(field, x, [0.0, 0.3], project=False, solver=solver).points[-1].square().sum()
-        gradients.append(torch.autograd.grad(loss, field.parameters(), materialize_grads=True))
-    torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-5)
 
 
 def blow_up(x: Tensor, t: Tensor) -> Tensor:
@@ -193,4 +151,3 @@ def test_a_least_step_takes_a_stiff_field_to_its_end() -> None:
 
 def test_no_points() -> None:
     assert flow(SCREW.velocity, torch.zeros(0, 3), 0.0, 1.0).shape == (0, 3)
-    assert track(small_spacetime(), torch.zeros(0, 3), [0.0, 0.5, 1.0]).points.shape == (3, 0, 3)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from fields import SCREW
 from mplicits.neural_fields import Box, Moving, Sphere, TimeSlice, at_time, flow
-from mplicits.neural_fields.spacetime.flow import Solver, flow_jacobian
+from mplicits.neural_fields.spacetime.flow import Solver
 from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocityJet, VelocitySiren
 from torch import Tensor
@@ -55,15 +55,11 @@ def test_characteristics_of_linear_flows(rows: tuple[tuple[float, ...], ...]) ->
     x = torch.nn.functional.normalize(torch.randn(40, 3, dtype=torch.float64), dim=-1)
     exact, bound = torch.linalg.matrix_exp(v.matrix), taylor_rest(v.matrix, STEPS) + 1e-14
     solver = Solver(method="rk4", step=1 / STEPS)
-    there, strain = flow_jacobian(v, x, 0.0, 1.0, solver=solver)
-    torch.testing.assert_close(there, flow(v, x, 0.0, 1.0, solver=solver), rtol=0, atol=1e-14)
+    there = flow(v, x, 0.0, 1.0, solver=solver)
     assert float((there - x @ exact.T).norm(dim=-1).max()) <= bound
-    assert float(torch.linalg.matrix_norm(strain - exact, 2).max()) <= bound
     # Coming back adds as much again, carried by the inverse, whose norm exp(‖A‖) bounds.
     back = flow(v, there, 1.0, 0.0, solver=solver)
     assert float((back - x).norm(dim=-1).max()) <= bound * (math.exp(float(v.matrix.norm())) + math.e)
-    volume = math.exp(float(v.matrix.trace()))
-    assert torch.linalg.det(strain).sub(volume).abs().max() <= 3 * bound * math.exp(2 * float(v.matrix.norm()))
 
 
 def test_energies_of_linear_flows() -> None:
