@@ -282,8 +282,7 @@ def _tell_evolution(record: dict[str, Any]) -> None:
     print(f"  {len(frames)} frames: volume {min(volumes):.3g} to {max(volumes):.3g}, components {_runs(counts)}")
     for change in checks["changes"]:
         before, after = (Topology(**change[side]) for side in ("before", "after"))
-        near = f", at {' '.join(f'{number:.3g}' for number in change['place'])}" if change["place"] else ""
-        print(f"  t = {change['time']:.3f}: {before} → {after}{near}")
+        print(f"  t = {change['time']:.3f}: {before} → {after}")
     if slopes["mean"] is not None:
         print(f"  |∇f| {slopes['mean']:.3f}, from {slopes['low']:.3f} to {slopes['high']:.3f} at nine of ten points")
     for line in checks["warnings"]:

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...neural_fields import Field, Similarity, TimeSlice
+from ...neural_fields import Field, TimeSlice
 from ...neural_fields.meshing.extract import surface_of
 from ..fit.samples import value_and_gradient
 from ..surface.measure import chamfer
 from ..surface.surface import sample_points, volume
 from .problem import End
 from .samples import band_points
-from .topology import Change, Topology, find_changes, topology_of
+from .topology import Topology, find_changes, topology_of
 
 END_RESOLUTION = 192
 
@@ -36,7 +36,6 @@ class FrameFigures:
 def check_evolution(
     field: Field,
     ends: Sequence[End],
-    similarity: Similarity | None = None,
     *,
     frames: int,
     resolution: int,
@@ -62,12 +61,13 @@ def check_evolution(
     times, found = [frame.time for frame in shown], [Topology(frame.components, frame.holes) for frame in shown]
     changes = find_changes(field, times, found, resolution=resolution, until=until)
     count(total, total)
-    place = similarity or Similarity.identity()
     checks = {
         "ends": met,
         "slopes": slopes,
         "frames": [vars(frame) for frame in shown],
-        "changes": [_as_dict(change, place) for change in changes],
+        "changes": [
+            vars(change) | {"before": change.before._asdict(), "after": change.after._asdict()} for change in changes
+        ],
     }
     return checks | {"warnings": warnings(checks)}
 
@@ -141,17 +141,6 @@ def _loose_parts(checks: dict[str, Any]) -> list[str]:
         f"{worst['components']} pieces at t = {worst['time']:.3g}, and {most} at most where shapes are met; a motion "
         "that is learnt carries parts instead (--kind deform)"
     ]
-
-
-def _as_dict(change: Change, similarity: Similarity) -> dict[str, Any]:
-    """For JSON, its place in input coordinates."""
-    return {
-        "time": change.time,
-        "within": change.within,
-        "before": change.before._asdict(),
-        "after": change.after._asdict(),
-        "place": None if change.place is None else similarity.to_input(np.array([change.place]))[0].tolist(),
-    }
 
 
 def frame_figures(field: Field, time: float, resolution: int) -> FrameFigures:

@@ -1,7 +1,6 @@
 """Changes of topology of a surface that moves. Of c pieces with h holes the Euler number is χ = V − E + F = 2 (c − h).
 
-f(x, t) changes it only where ∇f = 0 on the surface, at single points of space-time, so that two moments before and
-after a change differ near one place and nowhere else.
+f(x, t) changes it only where ∇f = 0 on the surface, at single points of space-time.
 """
 
 from __future__ import annotations
@@ -13,10 +12,8 @@ from time import monotonic
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from ...neural_fields import Field, Mesh, TimeSlice, at_time
+from ...neural_fields import Field, Mesh, TimeSlice
 from ...neural_fields.meshing.extract import surface_of
 from ..surface.surface import components
 
@@ -28,8 +25,6 @@ class ChangeOptions:
     narrow: float = 2e-3  # a change is searched for until it lies between two moments that are no further apart
     one: float = 1e-2  # changes that follow each other so soon are one: on a lattice a neck closes in several places
     most: int = 60  # moments that are meshed on the way, of all changes together
-    placed: int = 6  # changes whose place is searched for, of the first ones
-    cells: int = 2  # along the box that a place is searched down to
 
 
 CHANGES = ChangeOptions()
@@ -55,7 +50,6 @@ class Change:
     within: float  # how far they are from it
     before: Topology  # the surface at the first of them
     after: Topology  # at the second
-    place: tuple[float, float, float] | None  # where, to two cells of the mesh; None of all but the first ones
 
 
 def topology_of(surface: Mesh | None) -> Topology:
@@ -74,7 +68,7 @@ def find_changes(
     """The changes between growing ``times`` whose topology is ``found``, each by halving the interval that it lies in.
 
     What happens and is undone between two of the given moments, or within 0.01, is not seen. From the moment ``until``,
-    by `time.monotonic`, intervals stay as wide as they are and places unknown.
+    by `time.monotonic`, intervals stay as wide as they are.
     """
     pending = [
         _Bracket(times[index - 1], times[index], found[index - 1], found[index])
@@ -95,12 +89,8 @@ def find_changes(
             narrow[-1] = _Bracket(narrow[-1].start, end, narrow[-1].before, after)
         else:
             narrow.append(bracket)
-    changes: list[Change] = []
-    for start, end, before, after in (bracket for bracket in narrow if bracket.before != bracket.after):
-        placed = len(changes) < CHANGES.placed and monotonic() < until
-        place = _place(field, start, end, before, resolution) if placed else None
-        changes.append(Change((start + end) / 2, (end - start) / 2, before, after, place))
-    return changes
+    changed = (bracket for bracket in narrow if bracket.before != bracket.after)
+    return [Change((start + end) / 2, (end - start) / 2, before, after) for start, end, before, after in changed]
 
 
 class _Bracket(NamedTuple):
@@ -110,39 +100,3 @@ class _Bracket(NamedTuple):
     end: float
     before: Topology
     after: Topology
-
-
-def _place(field: Field, start: float, end: float, before: Topology, resolution: int) -> tuple[float, float, float]:
-    """Where the change between two moments is, by halving the box along one axis after the other.
-
-    The surface is meshed with what lies on one side of a plane at the later moment and the rest at the earlier one:
-    whether it has changed already says on which side the change is.
-    """
-    low, high = [-1.0] * 3, [1.0] * 3
-    for axis in range(3):
-        while high[axis] - low[axis] > CHANGES.cells * 2 / resolution:
-            middle = (low[axis] + high[axis]) / 2
-            passing = _Passing(field, start, end, tuple(low[:axis]), tuple(high[:axis]), middle)
-            changed = topology_of(surface_of(passing, resolution=resolution)) != before
-            (high if changed else low)[axis] = middle
-    x, y, z = ((a + b) / 2 for a, b in zip(low, high, strict=True))
-    return x, y, z
-
-
-@dataclass(frozen=True, eq=False)
-class _Passing:
-    """f(x, t(x)): the later moment below ``middle`` within a slab and before that slab, else the earlier one."""
-
-    field: Field
-    start: float
-    end: float
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    middle: float
-
-    def __call__(self, x: Tensor) -> Tensor:
-        later = x[..., len(self.low)] < self.middle
-        for axis in reversed(range(len(self.low))):
-            later = (x[..., axis] < self.low[axis]) | ((x[..., axis] < self.high[axis]) & later)
-        start, end = x.new_tensor(self.start), x.new_tensor(self.end)
-        return self.field.value(at_time(x, torch.where(later, end, start)))

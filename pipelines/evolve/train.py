@@ -147,7 +147,6 @@ class _Evolving(Training[EvolveConfig, SpaceTimeSDF]):
         record["checks"] = check_evolution(
             field,
             self.problem.ends,
-            self.similarity,
             frames=frames,
             resolution=self.config.resolution,
             count=count,
