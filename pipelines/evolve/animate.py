@@ -26,7 +26,7 @@ from ..render.film import ANIMATIONS, write_animation
 from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.trace import PRECISION, fine_strips, pixel_size, see_hits
-from ..texture.transport import Colors, TransportedColors, borrowed_texture, pinned_texture, start_texture
+from ..texture.transport import Colors, TransportedColors, borrowed_colors, shape_colors, start_colors
 from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, load_motion, read_record
 from .follow import follow_mesh
 from .shapes import Placement as ShapePlacement
@@ -150,17 +150,16 @@ def _transported(
         return None
     motion = load_motion(file)
     motion = None if motion is None else motion.to(field.like)
-    placed = None
     if options.colors is not None:
-        texture, placed = borrowed_texture(options.colors, field, similarity)
+        first = borrowed_colors(options.colors, field, similarity)
     else:
-        texture = start_texture(file, field)
+        first = start_colors(file, field)
     last = None if options.last_colors is None else last_colors(options.last_colors, file, field)
-    if texture is None and last is not None:
+    if first is None and last is not None:
         raise InputError(f"--last-colors: {file} has no colours at the start; name the first shape's run with --colors")
-    if texture is None:
+    if first is None:
         return None
-    return TransportedColors(field, texture, placed=placed, last=last, level=level, motion=motion)
+    return TransportedColors(field, first, last=last, level=level, motion=motion)
 
 
 def last_colors(run: str | Path, file: Path, field: Field) -> Colors:
@@ -171,11 +170,11 @@ def last_colors(run: str | Path, file: Path, field: Field) -> Colors:
         raise InputError(f"--last-colors {run}: {file} is not known to go from shape to shape")
     back = ShapePlacement.from_dict(placements[-1]).inverse()
 
-    def own(points: Tensor) -> Tensor:
+    def home(points: Tensor) -> Tensor:
         return torch.from_numpy(back.apply(points.double().cpu().numpy())).to(points)
 
-    colors = pinned_texture(run, field, 1.0, own)
-    return lambda points: colors(own(points))
+    geometry = load_field(find_field(run), device=field.deltas.device).field
+    return shape_colors("--last-colors", run, geometry, field, 1.0, home)
 
 
 def film_frames(moving: MovingSurface) -> Iterator[Image]:

@@ -59,60 +59,51 @@ def _solver(step: float) -> Solver:
     return Solver(method="rk4", step=step)
 
 
-def start_texture(run: str | Path, field: Field) -> TextureField | None:
-    """The texture beside a run, of its ``field`` or, if that moves, of its surface at time 0; None without one.
+def start_colors(run: str | Path, field: Field) -> Colors | None:
+    """The colours beside a run, of its ``field`` or, if that moves, of its surface at time 0; None without a texture.
 
     Raises:
         InputError: the texture is damaged or belongs to another field.
     """
-    return texture_of(run, field if field.in_dim == 3 else moment(field, 0.0))
+    texture = texture_of(run, field if field.in_dim == 3 else moment(field, 0.0))
+    return None if texture is None else texture_colors(texture)
 
 
-def borrowed_texture(run: str | Path, field: Field, similarity: Similarity) -> tuple[TextureField, Similarity]:
-    """The texture of a run that does not move, for the start of a motion, and its way into the motion's coordinates.
+def borrowed_colors(run: str | Path, field: Field, similarity: Similarity) -> Colors:
+    """The colours of a run that does not move, for the start of a motion.
 
-    ``similarity`` is the way from the four-dimensional field's coordinates to input coordinates.
+    ``similarity`` is the way from input coordinates to those of the four-dimensional ``field``. Errors are those of
+    `shape_colors`.
+    """
+    geometry, own, _ = load_field(find_field(run), device=field.deltas.device)
+    center, scale = (np.asarray(own.center) - similarity.center) / similarity.scale, own.scale / similarity.scale
+
+    def home(points: Tensor) -> Tensor:
+        return (points - points.new_tensor(center.tolist())) / scale
+
+    return shape_colors("--colors", run, geometry, field, 0.0, home)
+
+
+def shape_colors(flag: str, run: str | Path, geometry: Field, field: Field, time: float, home: Backward) -> Colors:
+    """The colours of a run with this ``geometry``, for the ``time`` 0 or 1 of a ``field`` that moves.
+
+    ``home`` brings points ``(N, 3)`` of the motion at that time into the run's coordinates.
 
     Raises:
-        InputError: it has no texture, or its surface is not that of the field at time 0.
+        InputError: it has no texture, or its surface is not that of the field then; the message names the ``flag``.
     """
-    file = find_field(run)
-    geometry, own, _ = load_field(file, device=field.deltas.device)
-    center = (np.asarray(own.center) - similarity.center) / similarity.scale
-    placed = Similarity((center[0], center[1], center[2]), own.scale / similarity.scale)
-    texture = _texture_at(
-        "--colors", run, geometry, field, 0.0, lambda points: (points - points.new_tensor(placed.center)) / placed.scale
-    )
-    return texture, placed
-
-
-def pinned_texture(run: str | Path, field: Field, time: float, own: Callable[[Tensor], Tensor]) -> Colors:
-    """The colours of a run that does not move, of points in its coordinates, for a moment of a motion.
-
-    ``own`` brings points ``(N, 3)`` of the motion at that ``time`` into the run's coordinates.
-
-    Raises:
-        InputError: it has no texture, or its surface is not that of the field then.
-    """
-    geometry = load_field(find_field(run), device=field.deltas.device).field
-    return texture_colors(_texture_at("--last-colors", run, geometry, field, time, own))
-
-
-def _texture_at(
-    flag: str, run: str | Path, geometry: Field, field: Field, time: float, own: Callable[[Tensor], Tensor]
-) -> TextureField:
     texture = texture_of(find_field(run), geometry) if geometry.in_dim == 3 else None
     if texture is None:
         raise InputError(f"{flag} {run}: has no texture; make one with `mplicits texture {run} COLORS`")
+    colors = texture_colors(texture)
     mesh = surface_of(moment(field, time), resolution=TRANSPORT.checked)
-    if mesh is None:
-        return texture  # there is nothing to be coloured
-    points = own(torch.from_numpy(mesh.vertices).to(field.like))
-    points = points[points.norm(dim=-1) < 1]  # what the texture's fit says elsewhere is no surface of anything
-    if not len(points) or float(geometry.value(points).abs().mean()) > TRANSPORT.astray:
-        which = ("starts", "first") if time == 0 else ("ends", "last")
-        raise InputError(f"{flag} {run}: is not where the motion {which[0]}; name the run of its {which[1]} shape")
-    return texture
+    if mesh is not None:
+        points = home(torch.from_numpy(mesh.vertices).to(field.like))
+        points = points[points.norm(dim=-1) < 1]  # what the texture's fit says elsewhere is no surface of anything
+        if not len(points) or float(geometry.value(points).abs().mean()) > TRANSPORT.astray:
+            which = ("starts", "first") if time == 0 else ("ends", "last")
+            raise InputError(f"{flag} {run}: is not where the motion {which[0]}; name the run of its {which[1]} shape")
+    return lambda points: colors(home(points))
 
 
 class TransportedPoints:
@@ -160,24 +151,22 @@ class TransportedPoints:
 
 
 class TransportedColors:
-    """The colours of a surface that moves: those that its points had at time 0, of a texture or any function of points.
+    """The colours of a surface that moves: those that its points had ``first``, at time 0.
 
-    ``placed`` goes from the texture's coordinates to the field's. ``last`` are colours at time 1, for a blend: they
-    weigh t, those of the start 1 − t. ``motion`` is the velocity that was learnt; see `TransportedPoints`.
+    ``last`` are colours at time 1, for a blend: they weigh t, those of the start 1 − t. ``motion`` is the velocity that
+    was learnt; see `TransportedPoints`.
     """
 
     def __init__(
         self,
         field: Field,
-        texture: TextureField | Colors,
+        first: Colors,
         *,
-        placed: Similarity | None = None,
         last: Colors | None = None,
         level: int = -1,
         motion: VectorField | None = None,
     ) -> None:
         self._points = TransportedPoints(field, level=level, motion=motion)
-        first = texture_colors(texture, placed) if isinstance(texture, TextureField) else texture
         self._ends = [_Pinned(field, 0.0, first, level)]
         if last is not None:
             self._ends.append(_Pinned(field, 1.0, last, level))
@@ -227,16 +216,9 @@ class _Pinned:
         return SpreadColors(points, self.colors(points))
 
 
-def texture_colors(texture: TextureField, placed: Similarity | None = None) -> Colors:
-    """What a texture says at points; ``placed`` goes from its coordinates to those of the points."""
-    placed = placed or Similarity.identity()
-
-    @torch.no_grad()
-    def colors(points: Tensor) -> Tensor:
-        center = points.new_tensor(placed.center)
-        return map_colors(texture, (points - center) / placed.scale).values
-
-    return colors
+def texture_colors(texture: TextureField) -> Colors:
+    """The colours of a texture at points ``(N, 3)`` near its surface."""
+    return lambda points: map_colors(texture, points).values
 
 
 class _Interpolation:
@@ -267,10 +249,8 @@ def colors_of_run(run: str | Path, field: Field, time: float | None) -> Colors |
         InputError: the texture is damaged or belongs to another field.
     """
     moving = None if time is None else load_field(find_field(run), device=field.deltas.device).field
-    texture = start_texture(run, field if moving is None else moving)
-    if texture is None:
-        return None
-    if moving is None or time is None:
-        return lambda points: map_colors(texture, points).values
+    colors = start_colors(run, field if moving is None else moving)
+    if colors is None or moving is None or time is None:
+        return colors
     motion = load_motion(find_field(run))
-    return TransportedColors(moving, texture, motion=None if motion is None else motion.to(moving.like)).at(time)
+    return TransportedColors(moving, colors, motion=None if motion is None else motion.to(moving.like)).at(time)

@@ -42,7 +42,7 @@ from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.render.draw import Orbit, RenderOptions, render_run
 from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.texture.spread import CELL
-from mplicits.pipelines.texture.transport import TransportedColors, borrowed_texture
+from mplicits.pipelines.texture.transport import TransportedColors, borrowed_colors, texture_colors
 from mplicits.pipelines.training.folder import load_still
 
 RADIUS, DRIFT = 0.3, torch.tensor([0.5, 0.0, 0.0])
@@ -225,7 +225,7 @@ def test_a_mesh_is_not_followed_through_a_merger():
 
 def test_colours_ride_along_with_a_rigid_motion(run):
     field, texture = moving_field(run), start_texture(run)
-    transported = TransportedColors(field, texture)
+    transported = TransportedColors(field, texture_colors(texture))
     points, there = points_of(field, 0.0), points_of(field, 1.0)
     torch.testing.assert_close(transported.at(0.0)(points), texture.colors(points))
     torch.testing.assert_close(transported.at(1.0)(there), texture.colors(there - DRIFT), atol=0.01, rtol=0)
@@ -236,7 +236,7 @@ def test_colours_ride_along_a_velocity_that_was_learnt(run):
     field, texture = moving_field(run), start_texture(run)
     motion = RigidMotion(angle=1.0, center=tuple(START.tolist()), velocity=tuple(DRIFT.tolist()))
     there = points_of(field, 1.0)
-    found = TransportedColors(field, texture, motion=motion.velocity).at(1.0)(there)
+    found = TransportedColors(field, texture_colors(texture), motion=motion.velocity).at(1.0)(there)
     start, home = moment(field, 0.0), motion.inverse(there, 1.0)
     back = project_to_surface(start, home)[0]
     near = start.value(home).abs() < 0.4 * CELL  # from half a cell on colours are averaged
@@ -258,17 +258,17 @@ def test_colours_are_borrowed_from_a_run_in_other_units(run, tmp_path):
     texture = TextureField(start, ColorSiren(16, 1, omega=4.0), delta=0.1).requires_grad_(False)
     save_field(tmp_path / "field.safetensors", start, similarity=own)
     save_texture(tmp_path / "texture.safetensors", texture)
-    borrowed, placed = borrowed_texture(tmp_path, field, place)
+    borrowed = borrowed_colors(tmp_path, field, place)
     points = points_of(field, 0.0)
     same = torch.from_numpy(own.to_unit(place.to_input(points.numpy()))).float()
-    found = TransportedColors(field, borrowed, placed=placed).at(0.0)(points)
+    found = TransportedColors(field, borrowed).at(0.0)(points)
     torch.testing.assert_close(found, texture.colors(same), atol=1e-4, rtol=0)
     with torch.no_grad():
         first.weight *= 1.5
     save_field(tmp_path / "field.safetensors", start, similarity=own)
     save_texture(tmp_path / "texture.safetensors", TextureField(start, ColorSiren(16, 1), delta=0.1))
     with pytest.raises(InputError, match=r"--colors .*: is not where the motion starts"):
-        borrowed_texture(tmp_path, field, place)
+        borrowed_colors(tmp_path, field, place)
 
 
 def test_colours_of_the_last_shape_are_where_it_was_put(run, tmp_path):
@@ -303,7 +303,9 @@ def test_colours_ride_along_the_normals():
     assert float(expected.std(dim=0).min()) > 0.01
     for t in (0.0, 0.3, 1.0):
         points = towards * field.radius_at(torch.tensor(t))
-        torch.testing.assert_close(TransportedColors(field, texture).at(t)(points), expected, atol=2e-3, rtol=0)
+        torch.testing.assert_close(
+            TransportedColors(field, texture_colors(texture)).at(t)(points), expected, atol=2e-3, rtol=0
+        )
 
 
 def test_colours_of_both_ends_fade_into_each_other():
