@@ -25,34 +25,11 @@ from .field import Field, FieldLike, Jet, as_field, solid
 from .similarity import Similarity
 
 
-class Combined(Field):
-    """A field of fields; a subclass defines the points of the parts, and how values and jets join."""
+class Gated(Field):
+    """A field of other fields, whose level j + 1 is h_{j+1} where every coarser |h_i| < δ_i, and h_j elsewhere.
 
-    def __init__(self, *parts: FieldLike) -> None:
-        super().__init__()
-        fields = [as_field(part) for part in parts]
-        if len({field.in_dim for field in fields}) != 1:
-            dims = [field.in_dim for field in fields]
-            raise ValueError(f"parts of {dims} dimensions; expected at least one, all equal")
-        self.parts = torch.nn.ModuleList(fields)
-        self.in_dim, self.num_levels = fields[0].in_dim, max(field.num_levels for field in fields)
-
-    @property
-    def fields(self) -> tuple[Field, ...]:
-        """The parts."""
-        return tuple(self.parts)  # pyright: ignore[reportReturnType]
-
-    @property
-    def same_rows(self) -> bool:
-        """Whether it holds for every part."""
-        return all(field.same_rows for field in self.fields)
-
-    @property
-    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands: the widest of the parts at each level, plus what the combination adds."""
-        bands = [field.deltas for field in self.fields]
-        padded = [torch.nn.functional.pad(band, (0, self.num_levels - 1 - len(band))) for band in bands]
-        return self._band(torch.stack(padded).amax(dim=0))
+    A subclass defines the values of all levels without that, and the jet of one of them.
+    """
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`."""
@@ -100,21 +77,60 @@ class Combined(Field):
 
     def _walk(self, x: Tensor, level: int) -> tuple[list[Tensor], Tensor]:
         """The values of all levels up to ``level``, and the level that each point reaches, int64 ``(...,)``."""
-        home = self._home(self.check_points(x))
-        with one_evaluation():
-            columns = [field.level_values(home, level=min(level, field.num_levels - 1)) for field in self.fields]
-        found = [self._join(x, [column[0] for column in columns])]
-        inside = torch.ones_like(found[0], dtype=torch.bool)
+        first, *finer = self._levels(self.check_points(x), level)
+        found, inside = [first], torch.ones_like(first, dtype=torch.bool)
         reached = torch.zeros_like(inside, dtype=torch.int64)
-        for each, delta in zip(range(1, level + 1), self.deltas, strict=False):
+        for joined, delta in zip(finer, self.deltas, strict=False):
             inside = inside & (found[-1].abs() < delta)
-            joined = self._join(x, [column[min(each, len(column) - 1)] for column in columns])
             found.append(torch.where(inside, joined, found[-1]))
             reached = reached + inside
         return found, reached
 
+    @abstractmethod
+    def _levels(self, x: Tensor, level: int) -> list[Tensor]:
+        """The values ``(...,)`` of the levels up to ``level`` everywhere, coarse to fine."""
+
+    @abstractmethod
     def _jet(self, x: Tensor, level: int) -> Jet:
         """The jet of one level, wherever ``x`` is."""
+
+
+class Combined(Gated):
+    """A field of fields; a subclass defines the points of the parts, and how values and jets join."""
+
+    def __init__(self, *parts: FieldLike) -> None:
+        super().__init__()
+        fields = [as_field(part) for part in parts]
+        if len({field.in_dim for field in fields}) != 1:
+            dims = [field.in_dim for field in fields]
+            raise ValueError(f"parts of {dims} dimensions; expected at least one, all equal")
+        self.parts = torch.nn.ModuleList(fields)
+        self.in_dim, self.num_levels = fields[0].in_dim, max(field.num_levels for field in fields)
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """The parts."""
+        return tuple(self.parts)  # pyright: ignore[reportReturnType]
+
+    @property
+    def same_rows(self) -> bool:
+        """Whether it holds for every part."""
+        return all(field.same_rows for field in self.fields)
+
+    @property
+    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Half-widths of the bands: the widest of the parts at each level, plus what the combination adds."""
+        bands = [field.deltas for field in self.fields]
+        padded = [torch.nn.functional.pad(band, (0, self.num_levels - 1 - len(band))) for band in bands]
+        return self._band(torch.stack(padded).amax(dim=0))
+
+    def _levels(self, x: Tensor, level: int) -> list[Tensor]:
+        home = self._home(x)
+        with one_evaluation():
+            columns = [field.level_values(home, level=min(level, field.num_levels - 1)) for field in self.fields]
+        return [self._join(x, [column[min(each, len(column) - 1)] for column in columns]) for each in range(level + 1)]
+
+    def _jet(self, x: Tensor, level: int) -> Jet:
         home = self._home(x)
         return self._join_jets(x, [field.jet(home, level=min(level, field.num_levels - 1)) for field in self.fields])
 
