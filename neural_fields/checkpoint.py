@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save
@@ -23,6 +24,7 @@ from .fields.csg import Bounded, Combined, Difference, Intersection, Offset, Pla
 from .fields.field import Field, plain
 from .fields.primitives import Box, Capsule, Plane, Sphere, Torus
 from .fields.similarity import Similarity
+from .fields.tiled import Split, Tile, TiledField
 from .networks.colors import BackgroundField, ColorNetwork, ColorSiren, Radiance, TextureField
 from .networks.encoded import EncodedField
 from .networks.grids import HashEncoding, grid_resolutions
@@ -82,6 +84,30 @@ class SavedField(NamedTuple):
     metadata: dict[str, Any]
 
 
+@dataclasses.dataclass(frozen=True)
+class TileFiles:
+    """The tiles of a `TiledField` in files of `save_field`.
+
+    Attributes:
+        folder: that of the field's own file.
+        names: paths of the tiles from there.
+        similarity: from input coordinates to those of all tiles.
+        signs: −1 for tiles whose inside is to be outside.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    similarity: Similarity
+    signs: tuple[int, ...]
+
+    def __call__(self, number: int) -> Tile:
+        """Read a tile; errors as of `load_field`."""
+        field, own, _ = load_field(self.folder / self.names[number])
+        center = (np.asarray(own.center) - self.similarity.center) / self.similarity.scale
+        x, y, z = center.tolist()
+        return Tile(field, Similarity((x, y, z), own.scale / self.similarity.scale), self.signs[number])
+
+
 def save_field(
     path: str | os.PathLike[str],
     field: Field,
@@ -93,8 +119,8 @@ def save_field(
 
     Args:
         path: the file; replaced.
-        field: a `Siren`, a `MultiscaleSDF` of them, a `SpaceTimeSDF` of that, a closed form such as `Sphere`, or a
-            combination of these such as `Union`.
+        field: a `Siren`, a `MultiscaleSDF` of them, a `SpaceTimeSDF` of that, a closed form such as `Sphere`, a
+            combination of these such as `Union`, or a `TiledField` of `TileFiles` in the folder of the file.
         similarity: from input to unit-sphere coordinates; the identity by default.
         metadata: JSON values to keep with the field.
 
@@ -125,9 +151,10 @@ def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cp
     """
     path = Path(path)
     with _reading(path, _FIELD, device) as (header, tensors):
-        field = _build(header["field"], tensors)
-        _restore(path, field, tensors, "fit the field again")
         similarity = similarity_of(header["similarity"])
+        tiled = header["field"]["type"] == "TiledField"
+        field = _tiled(header["field"], path.parent, similarity) if tiled else _build(header["field"], tensors)
+        _restore(path, field, tensors, "fit the field again")
         return SavedField(field.to(device).requires_grad_(False), similarity, header["metadata"])
 
 
@@ -341,6 +368,9 @@ def _describe(field: Field) -> dict[str, Any]:
     if isinstance(field, EncodedField):
         grid = _grid_of(field.grid)
         return {"type": "EncodedField", "field": _describe(field.field), "grid": grid, "gain": field.gain}
+    if isinstance(field, TiledField) and isinstance(field.load, TileFiles):
+        about = {"levels": field.num_levels, "tiles": field.load.names, "signs": field.load.signs}
+        return {"type": "TiledField", **about, **plain(field.definition())}
     name = "Siren" if isinstance(field, Siren) else type(field).__name__
     if isinstance(field, Siren | NeusSDF) or type(field) is CLOSED.get(name):
         return {"type": name, **plain(field.definition())}
@@ -353,6 +383,20 @@ def _describe(field: Field) -> dict[str, Any]:
         f"a {name} cannot be saved; expected a Siren, a MultiscaleSDF of Sirens, a SpaceTimeSDF, one of them encoded, "
         "a closed form, or a combination of these; a mesh of it can be (extract_mesh)"
     )
+
+
+def _tiled(description: Mapping[str, Any], folder: Path, similarity: Similarity) -> TiledField:
+    """A field whose tiles are files in ``folder``; InputError if one is missing."""
+    names, signs = tuple(description["tiles"]), tuple(description["signs"])
+    splits = [Split(*split) for split in description["splits"]]
+    if not len(names) == len(signs) == len(splits) + 1:
+        raise ValueError(f"{len(splits)} splits, {len(names)} tiles and {len(signs)} signs")
+    for name in names:
+        if not (folder / name).is_file():
+            raise InputError(f"{folder / name}: no such file; it is a tile of {folder}: bring it back, or fit again")
+    deltas = [1.0] * (description["levels"] - 1)  # they are among the tensors
+    numbers = {name: description[name] for name in ("reach", "gap", "domain")}
+    return TiledField(TileFiles(folder, names, similarity, signs), splits, deltas=deltas, **numbers)
 
 
 def similarity_of(described: Mapping[str, Any]) -> Similarity:

@@ -6,6 +6,7 @@ import mplicits.neural_fields as nf
 import torch
 from mplicits.neural_fields.fields.csg import Bounded, Placed
 from mplicits.neural_fields.fields.field import SecondJet
+from mplicits.neural_fields.fields.tiled import Split, Tile, TiledField
 from mplicits.neural_fields.networks.encoded import EncodedField
 from mplicits.neural_fields.networks.grids import HashEncoding
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
@@ -73,6 +74,18 @@ def small_encoded() -> EncodedField:
     return field
 
 
+def small_tiled() -> TiledField:
+    """Three tiles of different fields, whose blends and reach show, and one of them inside out."""
+    parts = [small_multiscale(0.4), two_levels(), nf.Torus(major=0.5, minor=0.2)]
+    signs = (1, -1, 1)
+    tiles = [
+        Tile(part, nf.Similarity((0.3 * k - 0.3, 0.1, 0.0), 0.9), sign)
+        for k, (part, sign) in enumerate(zip(parts, signs, strict=True))
+    ]
+    splits = [Split(0, -0.2, 0.3, -1, 1), Split(1, 0.1, 0.2, -2, -3)]
+    return TiledField(tiles.__getitem__, splits, deltas=(0.2, 0.1), reach=0.4, gap=0.05)
+
+
 class Watched(nf.Field):
     """A field that records the points of its evaluations, of values and of jets."""
 
@@ -137,6 +150,7 @@ FIELDS: dict[str, Callable[[], nf.Field]] = {
     "shell-of-moving": lambda: nf.Shell(nf.Moving(small_multiscale(), SCREW), inside=0.1),
     "placed": lambda: Placed(small_multiscale(0.4), nf.Similarity((0.2, 0.1, -0.1), 0.7)),
     "bounded": lambda: Bounded(small_multiscale(0.4), radius=0.8),
+    "tiled": small_tiled,
     "function": lambda: nf.FunctionField(lambda x: x.norm(dim=-1) - 0.5),
     "siren": lambda: nf.Siren(24, 2, omega=4.0),
     "siren-deep-features": lambda: nf.Siren(16, 4, omega=4.0, num_features=3),
