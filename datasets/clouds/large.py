@@ -64,7 +64,7 @@ class Merging:
         return f"{text}; dropped {dropped}" if dropped else text
 
 
-class _Survey(NamedTuple):
+class Survey(NamedTuple):
     """The bounds of a cloud, and which columns it has."""
 
     low: Float64  # (3,) lowest corner of the finite points
@@ -94,7 +94,7 @@ def merge_cloud(
     if limit < 1:
         raise ValueError(f"limit={limit}: expected at least one")
     started = time.monotonic()
-    frame = _survey(stream)
+    frame = survey(stream)
     if not frame.extent > 0:
         return None
     groups, size = _grouped(stream, frame, voxel or _first_size(frame, limit), limit)
@@ -122,10 +122,11 @@ def merge_cloud(
     )
 
 
-def _survey(stream: CloudStream) -> _Survey:
+def survey(stream: CloudStream, sample: int | None = None) -> Survey:
+    """Read a stream once, and keep about ``sample`` of its points, by default enough to estimate the size of voxels."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     read, finite, normals = 0, 0, False
-    stride = 1 + stream.count // MERGE.sample
+    stride = 1 + stream.count // (sample or MERGE.sample)
     samples: list[Float64] = []
     colors: list[NDArray[Any]] = []
     for piece in stream.pieces(MERGE.rows):
@@ -140,10 +141,10 @@ def _survey(stream: CloudStream) -> _Survey:
         read += len(piece.points)
     extent = float((high - low).max()) if finite else 0.0
     scale = color_scale(np.concatenate(colors)) if colors else None
-    return _Survey(low, extent, finite, np.concatenate(samples) - low, normals, scale, read)
+    return Survey(low, extent, finite, np.concatenate(samples) - low, normals, scale, read)
 
 
-def _first_size(frame: _Survey, limit: int) -> float:
+def _first_size(frame: Survey, limit: int) -> float:
     """The edge of voxels, if a surface meets about half of ``limit``; their number goes as one over it squared."""
     size, found = frame.extent, 1
     # With 20 points of the sample per cell, nearly all cells of the surface are found.
@@ -153,11 +154,11 @@ def _first_size(frame: _Survey, limit: int) -> float:
     return size * math.sqrt(found / (0.5 * limit))
 
 
-def _grouped(stream: CloudStream, frame: _Survey, size: float, limit: int) -> tuple[_Groups, float]:
+def _grouped(stream: CloudStream, frame: Survey, size: float, limit: int) -> tuple[_Groups, float]:
     """Sums of all points by voxel and direction, and the edge of the voxels, doubled whenever there are too many."""
     size = max(size, frame.extent / ((1 << MERGE.bits) - 2))
     groups = _Groups(np.empty(0, np.int64), np.empty((0, 7 if frame.scale is None else 10)))
-    for offsets, normals, colors in _pieces(stream, frame):
+    for offsets, normals, colors in usable_pieces(stream, frame):
         keys = _cell_keys(offsets, size) << 3 | _directions(normals)
         ones = np.ones((len(keys), 1))
         fresh = _summed(keys, np.concatenate((ones, offsets, normals, colors), axis=1))
@@ -168,8 +169,8 @@ def _grouped(stream: CloudStream, frame: _Survey, size: float, limit: int) -> tu
     return groups, size
 
 
-def _pieces(stream: CloudStream, frame: _Survey) -> Iterator[tuple[Float64, Float64, Float64]]:
-    """Offsets, unit normals (zero where unusable) and colours (of no columns without any) of the finite points."""
+def usable_pieces(stream: CloudStream, frame: Survey) -> Iterator[tuple[Float64, Float64, Float64]]:
+    """Of the finite points: offsets from ``frame.low``, unit normals (zero where unusable), colours (or no columns)."""
     for piece in stream.pieces(MERGE.rows):
         points = piece.points.astype(np.float64)
         finite = usable_rows(points)

@@ -46,6 +46,12 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("clouds", nargs="+", metavar="CLOUD", help=f"{what}; several clouds get a run each, RUN/NAME")
     add_new_run(parser, "directory of the run, or runs")
     add("--jobs", type=whole(1), metavar="N", help="several clouds: fits at a time; above 1 needs mplicits[ray]")
+    add(
+        "--tiles", choices=["auto"], help="cut a cloud that one network cannot hold into tiles, by its number of points"
+    )
+    add("--tile-size", type=positive, metavar="LENGTH", help="cut it into tiles with edges of this length, in its unit")
+    what = "of a Ray cluster whose machines share RUN: fit tiles there"
+    add("--ray-address", metavar="ADDRESS", help=what)
     what = "then learn the colours, if there are any, and write the mesh (.ply, .obj, .stl, .glb)"
     add("--mesh", type=Path, metavar="FILE", help=what)
     add("--no-colors", action="store_true", help="leave the colours out of --mesh")
@@ -76,6 +82,9 @@ def _fit(arguments: argparse.Namespace) -> int:
     config = new_settings(arguments, FitConfig)
     if arguments.mesh is None:
         refuse(arguments, ["no_colors"], "is about --mesh FILE; leave it out, or add that")
+    if arguments.tiles is not None or arguments.tile_size is not None:
+        return _fit_tiles(arguments, config)
+    refuse(arguments, ["ray_address"], "is for tiles; add --tiles auto, or leave it out")
     if len(arguments.clouds) > 1 or arguments.jobs is not None:
         return _fit_many(arguments, config)
     return _fit_one(arguments, arguments.clouds[0], config)
@@ -173,6 +182,65 @@ def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     return int(any(outcome.error is not None for outcome in outcomes))
 
 
+def _fit_tiles(arguments: argparse.Namespace, config: FitConfig | None) -> int:
+    """One cloud in tiles."""
+    refuse(arguments, ["watch", "tensorboard", "mesh"], "does not go with tiles; leave it out")
+    if len(arguments.clouds) > 1:
+        raise input_error(f"{arguments.clouds[1]}: tiles are of one cloud; name only one")
+    cloud = arguments.clouds[0]
+    if _depth_input(arguments, cloud) is not None:
+        raise input_error(f"{cloud}: holds depth maps, which are not cut into tiles; leave out --tiles")
+    from ..fit.tiles import fit_tiles, plan_fit
+    from ..training.folder import check_new_run
+    from ..training.jobs import check_jobs
+
+    jobs = arguments.jobs or 1
+    check_jobs(jobs)
+    check_new_run(arguments.out, resume=False, force=arguments.force or arguments.resume)
+    how = ("--tiles", "auto") if arguments.tile_size is None else ("--tile-size", arguments.tile_size)
+    more = ("--jobs", jobs) * (jobs > 1) + ("--ray-address", arguments.ray_address) * (
+        arguments.ray_address is not None
+    )
+    again = command_line("fit", cloud, "-o", arguments.out, *how, *more, "--resume")
+    with training(f"to continue: {again}", quiet=arguments.quiet, at_any_time=True) as show:
+        report = show or (lambda _: None)
+        job = plan_fit(cloud, arguments.out, config, size=arguments.tile_size, resume=arguments.resume, report=report)
+        tally = _Tally(job.plan.num_tiles, quiet=arguments.quiet)
+        alone = show is not None and jobs == 1 and arguments.ray_address is None
+        run = fit_tiles(
+            job,
+            jobs=jobs,
+            address=arguments.ray_address,
+            progress=(lambda name, step: report(replace(step, stage=f"tile {name} {step.stage}"))) if alone else None,
+            report=tally,
+        )
+    print(describe(arguments.out))
+    if run.record["seams"]["opposed"]:
+        print(
+            f"warning: {run.record['seams']['opposed']} pairs of tiles oppose each other; look at them", file=sys.stderr
+        )
+    print("next:", command_line("mesh", arguments.out, "-o", arguments.out / "mesh.ply", "--resolution", 1024))
+    return 0
+
+
+class _Tally:
+    """Says how many tiles are fitted, and how long the others will take."""
+
+    def __init__(self, total: int, *, quiet: bool) -> None:
+        self.total, self.quiet, self.done, self.started = total, quiet, 0, time.monotonic()
+
+    def __call__(self, outcome: FitOutcome) -> None:
+        """Count one tile."""
+        from ..training.progress import time_words
+
+        self.done += 1
+        left = (time.monotonic() - self.started) / self.done * (self.total - self.done)
+        result = "fitted" if outcome.error is None else outcome.error
+        if not self.quiet or outcome.error is not None:
+            name = outcome.item.directory.name
+            print(f"tile {name}: {result}; {self.done} of {self.total}, about {time_words(left)} left", file=sys.stderr)
+
+
 def _tell_outcome(outcome: FitOutcome) -> None:
     result = "fitted" if outcome.error is None else outcome.error
     print(f"{outcome.item.cloud}: {result}, after {outcome.seconds:.1f} s", file=sys.stderr)
@@ -255,8 +323,10 @@ def _describe_field(path: Path) -> Rows:
         ),
         ("parameters", f"{parameter_count(field):,} ({file.stat().st_size / 1024:,.0f} KiB on disk)"),
     ]
+    if "tiles" in record:
+        rows += _describe_tiles(record)
     stages = {stage.get("level"): stage for stage in record.get("stages", [])}
-    for index, level in enumerate(levels_of(field)):
+    for index, level in enumerate(() if "tiles" in record else levels_of(field)):
         stage = stages.get(index, {})
         rows.append((f"level {index}", _describe_level(level, stage)))
         judged = stage.get("held_out")
@@ -270,6 +340,23 @@ def _describe_field(path: Path) -> Rows:
     center = ", ".join(f"{number:.9g}" for number in similarity.center)
     rows.append(("input frame", f"center ({center}), 1 unit = {similarity.scale:.9g} input units"))
     return rows + _describe_record(record, path)
+
+
+def _describe_tiles(record: dict[str, Any]) -> Rows:
+    tiles, seams, memory = record["tiles"], record["seams"], record["peak_memory"]
+    errors = [tile["rms_at_points"] for tile in tiles]
+    rows: Rows = [
+        ("tiles", f"{len(tiles):,}, {record['parameters']:,} parameters in all"),
+        ("  errors", f"rms at the points {min(errors):.3g} to {max(errors):.3g} input units"),
+        (
+            "where they meet",
+            f"{seams['typical']:.3g} input units apart in the median, {seams['gap']:.3g} at most; blended over "
+            f"{seams['overlap']:.3g}",
+        ),
+    ]
+    if turned := sum(tile["sign"] < 0 for tile in tiles):
+        rows.append(("turned", f"{turned} tiles were inside out"))
+    return rows + ([("peak memory", f"{memory / 2**20:,.0f} MiB for one tile")] if memory else [])
 
 
 def _describe_level(level: Any, stage: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ import zipfile
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from ...datasets.clouds.cleaning.winding import DipoleField
 from ...datasets.clouds.large import Merging, merge_cloud
 from ...datasets.clouds.readers.columns import CloudStream, MemoryStream
 from ...datasets.clouds.readers.reading import check_cloud, open_stream
+from ...neural_fields import Similarity
 from ...neural_fields.backend.files import whole_file
 from ..training.folder import MERGED_FILE
 
@@ -146,6 +147,7 @@ class CloudDistance:
         given: number of the cloud's own points, the first ones; None for all. The others densify it.
         gaps: ``(N,)`` spacing of the cloud's own points at each point; None where there are no others.
         repaired: normals of points on edges that were replaced by one side's, for the record.
+        beyond: dipoles of a surface that goes on beyond the points, which count for signs only.
         options: numbers of the algorithm.
     """
 
@@ -160,9 +162,10 @@ class CloudDistance:
         given: int | None = None,
         gaps: Float32 | None = None,
         repaired: int = 0,
+        beyond: DipoleField | None = None,
         options: CloudOptions = CLOUD,
     ) -> None:
-        self.options = options
+        self.options, self._beyond = options, beyond
         self.points: Float32 = points.cpu().numpy()
         self.normals: Float32 = normals.cpu().numpy()
         self.tree = KDTree(self.points, compact_nodes=False, balanced_tree=False)
@@ -230,8 +233,9 @@ class CloudDistance:
         ``w(x) = Σ_i a_i ⟨p_i − x, n_i⟩ / 4π (|p_i − x|² + ε_i²)^(3/2)`` (Barill et al. 2018), see `DipoleField`.
         ε_i is ``soft`` standard deviations of the noise, or more for large discs.
         """
-        dipoles = self._softened(soft)
-        return np.concatenate([dipoles.winding(part) for part in _parts(x, self.options.places)])
+        fields = [field for field in (self._softened(soft), self._beyond) if field is not None]
+        parts = _parts(x, self.options.places)
+        return np.concatenate([np.sum([field.winding(part) for field in fields], axis=0) for part in parts])
 
     def _softened(self, soft: float) -> DipoleField:
         """The dipoles of the points, made once for each softening."""
@@ -265,6 +269,27 @@ class CloudDistance:
         areas = np.minimum(areas, self.options.largest_area * np.median(areas)).astype(np.float32)
         beside = np.median(areas[near[:, :count]], axis=1)
         return areas, np.minimum(areas, self.options.alone * beside).astype(np.float32)
+
+
+class Surroundings(NamedTuple):
+    """A file of what lies around a part of a cloud, ``(N, 6)``: points, and outward normals times areas, as the input.
+
+    Those in the box of the part, from ``low`` to ``high``, are left out.
+    """
+
+    file: Path
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    def dipoles(self, similarity: Similarity) -> DipoleField | None:
+        """Their winding number in the part's coordinates; None where there is nothing."""
+        rows = np.load(self.file)
+        rows = rows[((rows[:, :3] < self.low) | (rows[:, :3] > self.high)).any(axis=1)]
+        if not len(rows):
+            return None
+        dipoles = rows[:, 3:] / similarity.scale**2
+        radii = np.sqrt(np.linalg.norm(dipoles, axis=1) / math.pi)
+        return DipoleField(similarity.to_unit(rows[:, :3]), dipoles, CLOUD.soft * radii)
 
 
 def drawn(shares: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from ...datasets.clouds.cleaning.winding import DipoleField
 from .cloud import CLOUD, CloudDistance
 
 Float64 = NDArray[np.float64]
@@ -69,14 +70,15 @@ def dense_distance(
     noise: float = 0.0,
     guessed: bool = False,
     seed: int = 0,
+    beyond: DipoleField | None = None,
     options: DensificationOptions = DENSIFICATION,
 ) -> CloudDistance:
     """Distances to a cloud, densified where it is sparse for a network of frequency ``omega``.
 
     ``count`` limits the points of the cloud and the candidates between them together. See `CloudDistance` for
-    ``noise`` and ``guessed``.
+    ``noise``, ``guessed`` and ``beyond``.
     """
-    about = {"noise": noise, "guessed": guessed}
+    about: dict[str, Any] = {"noise": noise, "guessed": guessed, "beyond": beyond}
     index = CloudDistance(points, normals, **about)
     wanted = options.filling * np.maximum(index.areas * (omega / options.turn) ** 2 - 1, 0)
     new = min(count - len(points), math.ceil(wanted.sum()))

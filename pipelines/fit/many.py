@@ -18,7 +18,8 @@ from ..training.jobs import Outcome, check_jobs, run_jobs
 from ..training.progress import format_table
 from ..training.settings import FitConfig, load_config
 from ..training.trainer import Progress, Report
-from .train import fit
+from .cloud import Surroundings
+from .train import fit_part
 
 SETTINGS_FILE = "fits.json"  # in the directory of all runs: the settings of those yet to begin
 
@@ -27,12 +28,13 @@ FitOutcome = Outcome["FitJob", dict[str, Any]]
 
 @dataclass(frozen=True)
 class FitJob:
-    """One of the fits: a cloud and its run directory; a resumed run has its own settings."""
+    """One of the fits: a cloud, what lies around it, its run directory; a resumed run has its own settings."""
 
     cloud: Path
     directory: Path
     config: FitConfig
     resume: bool = False
+    around: Surroundings | None = None
 
 
 def plan_fits(
@@ -76,8 +78,8 @@ def fit_many(
     if planned:
         _keep_settings(out, planned[0].config)
     if jobs > 1 or progress is None:
-        return run_jobs(_fit, planned, jobs=jobs, report=report)
-    return run_jobs(lambda job: _fit(job, _named(progress, job.cloud.stem)), planned, report=report)
+        return run_jobs(fit_job, planned, jobs=jobs, report=report)
+    return run_jobs(lambda job: fit_job(job, _named(progress, job.cloud.stem)), planned, report=report)
 
 
 def format_fits(outcomes: Sequence[FitOutcome]) -> str:
@@ -94,12 +96,13 @@ def format_fits(outcomes: Sequence[FitOutcome]) -> str:
     return format_table(("cloud", "points", "rms at points", "time", "run"), rows)
 
 
-def _fit(job: FitJob, progress: Report | None = None) -> dict[str, Any]:
+def fit_job(job: FitJob, progress: Report | None = None) -> dict[str, Any]:
     """Fit one cloud, or resume it → its record."""
     if job.resume and is_fitted(job.directory):
         return read_record(job.directory)
     resume = job.resume and (job.directory / STATE_FILE).is_file()
-    return fit(job.cloud, job.config, out=job.directory, resume=resume, progress=progress).record
+    about = {"resume": resume, "around": job.around, "progress": progress}
+    return fit_part(job.cloud, job.config, out=job.directory, **about).record
 
 
 def _named(progress: Callable[[str, Progress], None], name: str) -> Report:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
+from ...datasets.clouds.cleaning.winding import DipoleField
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
 from ...neural_fields.backend.devices import choose_device, peak_memory
 from ..surface.surface import thinned
@@ -33,7 +34,7 @@ from ..training.trainer import (
     restore_frozen,
     stop_on_signals,
 )
-from .cloud import CloudDistance, load_cloud
+from .cloud import CloudDistance, Surroundings, load_cloud
 from .densification import dense_distance
 from .level import JUDGE, LEVEL, Judge, LevelObjective, calm_omega, held_out, new_level, noisy_points
 from .review import review_points
@@ -86,12 +87,26 @@ def fit_moved(
     return _fit(folder, file, config, source=str(out / name), progress=progress)
 
 
+def fit_part(
+    cloud: Path,
+    config: FitConfig,
+    *,
+    out: Path,
+    resume: bool = False,
+    around: Surroundings | None = None,
+    progress: Report | None = None,
+) -> Run[MultiscaleSDF]:
+    """`fit` a part of a cloud; what lies ``around`` it decides with it where inside is."""
+    return _fit(RunFolder(out, resume=resume), cloud, config, around=around, progress=progress)
+
+
 def _fit(
     folder: RunFolder,
     cloud: Cloud,
     config: FitConfig | None,
     *,
     source: str | None = None,
+    around: Surroundings | None = None,
     progress: Report | None = None,
     level_done: LevelDone | None = None,
 ) -> Run[MultiscaleSDF]:
@@ -113,6 +128,7 @@ def _fit(
     load_compiler()
     origin = {"reading": raw.reading, "merging": None if merging is None else dataclasses.asdict(merging)}
     fitting = _Fitting(prepared, source or raw.source, origin, config, folder, budget, report, level_done)
+    fitting.beyond = None if around is None else around.dipoles(prepared.similarity)
     with folder.writing(), stop_on_signals() as flag:
         if folder.resume:
             fitting.restore()
@@ -166,6 +182,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
         self.index: CloudDistance | None = None  # of the points that the level learns from
         self.held = torch.zeros(len(self.points), dtype=torch.bool)  # points held out of residual levels
+        self.beyond: DipoleField | None = None  # of the surface around the points
         self.signs: Signs | None = None  # given to the points without normals
         self.spacing = 0.0  # of all points
         self.errors = torch.empty(0)  # of the last frozen level, at all points
@@ -358,7 +375,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         Level 0 is not judged, so no point is held out of it: a small face may lie in a single voxel.
         """
         config, all_points = self.config, self.points.numpy()
-        about: dict[str, Any] = {"noise": self.cloud.noise, "guessed": self.cloud.estimated}
+        about: dict[str, Any] = {"noise": self.cloud.noise, "guessed": self.cloud.estimated, "beyond": self.beyond}
         self.spacing = spacing_of(all_points.astype(np.float64))
         share = config.hold_out if level and self.cloud.noisy is None else 0.0
         self.held = torch.from_numpy(held_out(all_points, self.spacing, share, seed=config.seed))

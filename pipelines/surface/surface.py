@@ -19,8 +19,8 @@ from ...datasets import PointCloud, read_cloud, spacing_of
 from ...datasets.clouds.point_cloud import spread_on_faces, unit_rows, voxel_representatives
 from ...datasets.clouds.readers.reading import read_mesh
 from ...datasets.textured.gltf import read_gltf
-from ...neural_fields import InputError, Mesh
-from ..training.folder import FIELD_FILE, SUPPORT_FILE, load_state
+from ...neural_fields import InputError, Mesh, Similarity
+from ..training.folder import FIELD_FILE, SUPPORT_FILE, load_state, read_record
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -303,6 +303,8 @@ def read_support(field: Path, record: dict[str, Any], level: int) -> Support | N
 
     ``record`` is what ``run.json`` holds. Raises an InputError if the points are damaged or of another run.
     """
+    if "tiles" in record:
+        return _support_of_tiles(field.parent, record, level)
     path = field.with_name(SUPPORT_FILE)
     stages = record.get("stages", [])
     photographed = "region" in record
@@ -320,3 +322,17 @@ def read_support(field: Path, record: dict[str, Any], level: int) -> Support | N
         return Support(points, float(tensors["seen_within"]), visible=True) if len(points) else None
     error = stages[level]["rms_at_points"] / record["similarity"]["scale"]
     return Support(points, support_radius(points, error=error))
+
+
+def _support_of_tiles(run: Path, record: dict[str, Any], level: int) -> Support | None:
+    """The supports of all tiles of a run, in its own coordinates; None if one of them has none."""
+    home, found = Similarity(**record["similarity"]), list[Support]()
+    for tile in record["tiles"]:
+        own = read_record(run / tile["run"])
+        support = read_support(run / tile["run"] / FIELD_FILE, own, min(level, len(own["stages"]) - 1))
+        if support is None:
+            return None
+        placed = Similarity(**own["similarity"])
+        points = home.to_unit(placed.to_input(support.points))
+        found.append(Support(points, support.radius * placed.scale / home.scale))
+    return Support(np.concatenate([part.points for part in found]), max(part.radius for part in found))

@@ -51,13 +51,16 @@ def run_jobs(
     items: Sequence[Item],
     *,
     jobs: int = 1,
+    address: str | None = None,
+    retries: int = 0,
     report: Callable[[Outcome[Item, Result]], None] | None = None,
 ) -> list[Outcome[Item, Result]]:
     """Call ``function`` on every item → one outcome per item, in their order; one that raises does not stop the others.
 
     With several ``jobs`` at a time it runs in other processes: what it takes, holds and returns is pickled, and torch
     there has its share of the cores, ``cores // jobs``. One job needs no Ray, and runs in this process. ``report`` is
-    told every outcome, as it comes.
+    told every outcome, as it comes. With the ``address`` of a Ray cluster, they run there, each with as many cores. An
+    item whose worker died is begun again ``retries`` times.
 
     Raises:
         InputError: see `check_jobs`.
@@ -66,13 +69,13 @@ def run_jobs(
     """
     check_jobs(jobs)
     report = report or (lambda _: None)
-    if jobs == 1 or len(items) < 2:
+    if address is None and (jobs == 1 or len(items) < 2):
         outcomes = []
         for item in items:
             outcomes.append(outcome_of(function, item))
             report(outcomes[-1])
         return outcomes
-    return _side_by_side(function, items, min(jobs, len(items)), report)
+    return _side_by_side(function, items, min(jobs, len(items)), report, address, retries)
 
 
 def outcome_of(function: Callable[[Item], Result], item: Item) -> Outcome[Item, Result]:
@@ -95,6 +98,8 @@ def _side_by_side(
     items: Sequence[Item],
     jobs: int,
     report: Callable[[Outcome[Item, Result]], None],
+    address: str | None,
+    retries: int,
 ) -> list[Outcome[Item, Result]]:
     for name, value in RAY_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
@@ -106,16 +111,18 @@ def _side_by_side(
         torch.set_num_threads(threads)
         return outcome_of(function, item)
 
-    ray.init(
-        address="local",
-        num_cpus=threads * jobs,
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level=logging.ERROR,
-        object_store_memory=128 << 20,  # items and results are small
-    )
+    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
+    if address is None:
+        own = {"num_cpus": threads * jobs, "include_dashboard": False}
+        ray.init(address="local", object_store_memory=128 << 20, **own, **quiet)  # items and results are small
+    else:
+        try:
+            ray.init(address=address, **quiet)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"--ray-address {address}: no Ray cluster answers there ({reason})") from error
     try:
-        task: Any = ray.remote(num_cpus=threads, num_gpus=gpus, max_retries=0)(work)
+        task: Any = ray.remote(num_cpus=threads, num_gpus=gpus, max_retries=retries)(work)
         waiting = {task.remote(item): index for index, item in enumerate(items)}
         outcomes: dict[int, Outcome[Item, Result]] = {}
         try:
