@@ -82,6 +82,29 @@ def _uneven(arguments: argparse.Namespace) -> int:
     return run_benches(arguments, [bench], out=arguments.out)
 
 
+def _tiles_arguments(parser: argparse.ArgumentParser) -> None:
+    number(parser, "--plots", whole(1), 4, "along each side of the town")
+    number(parser, "--points", whole(10_000), 1_000_000, "of the scan")
+    number(parser, "--workers", whole(1), 1, "tiles fitted at a time")
+    names = ("tiles", "one network", "screened Poisson")
+    parser.add_argument("--methods", nargs="+", choices=names, default=names, metavar="METHOD", help=", ".join(names))
+    number(parser, "--poisson-depth", whole(4, 14), 11, "octree depth")
+    measured_flags(parser, 1024)
+    folder_flag(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
+
+
+def _tiles(arguments: argparse.Namespace) -> int:
+    config = read_settings(arguments, FitConfig)
+    from ..shapes.tiles import TilesBench
+
+    names = ("plots", "points", "workers", "resolution", "eval_samples", "poisson_depth")
+    options = {name: getattr(arguments, name) for name in names}
+    bench = TilesBench(config=config, methods=tuple(arguments.methods), **options)
+    return run_benches(arguments, [bench], out=arguments.out)
+
+
 def _signs_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
     noisy_flags(parser)
@@ -225,6 +248,15 @@ SHAPES: Mapping[str, Command] = MappingProxyType(
             _uneven_arguments,
             _uneven,
             "Draw uneven points on exact shapes, or on meshes, and compare every level with screened Poisson.",
+        ),
+        "tiles": Command(
+            "a town that one network cannot hold",
+            """  python -m benchmarks tiles --preset fast --workers 2 -o bench_tiles
+  python -m benchmarks tiles --plots 12 --points 10000000 --methods tiles -o bench_tiles""",
+            _tiles_arguments,
+            _tiles,
+            "Scan an exact town from the air and from its streets, fit it in tiles, by one network and by screened "
+            "Poisson: distances, differences at borders of tiles, seconds and memory.",
         ),
         "signs": Command(
             "how many estimated normals point the wrong way",
