@@ -17,7 +17,8 @@ from mplicits.datasets.clouds.tiling import TilePlan
 from mplicits.neural_fields import Field, Mesh, Similarity, extract_mesh
 from mplicits.pipelines.fit.tiles import fit_tiles, plan_fit
 from mplicits.pipelines.fit.train import fit, prepare
-from mplicits.pipelines.surface.surface import components, sample_points
+from mplicits.pipelines.surface.surface import components, drop_unsupported, read_support, sample_points
+from mplicits.pipelines.training.folder import FIELD_FILE, read_record
 from mplicits.pipelines.training.settings import FitConfig
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -144,6 +145,9 @@ class TilesBench(Benchmark[TilesRow]):
         inside = border = None
         if field is not None:
             mesh = extract_mesh(field, resolution=self.resolution, bounds=_box(town, similarity))
+            support = read_support(home / "run" / FIELD_FILE, read_record(home / "run"), field.num_levels - 1)
+            if support is not None:
+                mesh = drop_unsupported(mesh, support.points, radius=support.radius).mesh
             if plan is not None:
                 off = np.abs(_distances(field, similarity, truth))
                 blended = _blended(plan, truth + TOWN.origin)

@@ -93,11 +93,12 @@ class JudgeOptions:
     learnt: float = 0.8  # root mean square at training points over that without the level: less is a large gain
     voxel: float = 2.0  # edge of a voxel in spacings: about four points, a gap that neighbours can still fill
     surely: float = 2.0  # standard errors
-    # In parts of the schedule. Means of weights show in its middle what the falling rate shows at its end.
-    averaged: float = 0.07  # time constant of the mean
-    hopeless: float = 0.4  # when training ends if the score has never been less than without the level
-    patience: float = 0.3  # time without a lesser score after which training ends
+    averaged: float = 0.07  # time constant of the mean of weights, in parts of the schedule
     looks: int = 20  # judgements of a level during its training
+    halfway: int = 8  # after how many of them training ends if the level is useless
+    # Score over that without the level from which on it is. Most gains come late, as the rate falls: a level that was
+    # 1.1 times worse halfway ended at four fifths.
+    useless: float = 1.5
 
 
 JUDGE = JudgeOptions()
@@ -347,7 +348,7 @@ class LevelObjective(Objective):
         self.shares = [None if area is None else area.cpu().double().cumsum(0) for area in areas]
         if judge is not None:  # `kept` is part of the checkpoints
             weights = siren.state_dict()
-            starts = {"looks": 0.0, "averaged": 0.0, "at": 1.0, "least": math.inf}
+            starts = {"looks": 0.0, "averaged": 0.0, "at": 1.0, "least": math.inf, "score": 0.0}
             self.kept = {name: torch.tensor(start, dtype=torch.float64) for name, start in starts.items()}
             self.kept |= {prefix + name: weights[name].clone() for prefix in (MEAN, BEST) for name in weights}
 
@@ -391,6 +392,7 @@ class LevelObjective(Objective):
         mean = copy.deepcopy(self.siren)
         mean.load_state_dict(without_prefix(MEAN, self.kept))
         score = self.judge.score(self.judge.errors(mean).mean())
+        self.kept["score"].fill_(score)
         if score < float(self.kept["least"]) or self.judge.noisy:
             self.kept["least"].fill_(score)
             self.kept["at"].fill_(done)
@@ -399,12 +401,10 @@ class LevelObjective(Objective):
 
     @property
     def settled(self) -> bool:
-        """See `Objective.settled`: held-out points say that the level is no use, or that it gets no better."""
-        if self.judge is None:
+        """See `Objective.settled`: held-out points say that the level is no use."""
+        if self.judge is None or self.judge.noisy or int(self.kept["looks"]) < JUDGE.halfway:
             return False
-        done, at, least = (float(self.kept[name]) for name in ("averaged", "at", "least"))
-        useless = not self.judge.noisy and done >= JUDGE.hopeless and least >= self.judge.score(self.judge.before)
-        return useless or (math.isfinite(least) and done >= at + JUDGE.patience)
+        return float(self.kept["score"]) >= JUDGE.useless * self.judge.score(self.judge.before)
 
     def take_best(self) -> Verdict | None:
         """Take the mean weights of the least score → the verdict; None, and the last weights, without a judge."""
