@@ -1,7 +1,8 @@
 """GLTF 2.0 and GLB (Khronos, "glTF 2.0 Specification"): triangles, base colours and textures, placed by the nodes.
 
 Files written by this package are read in the input coordinates that their node holds. trimesh rounds base colours to 8
-bits of linear light, and loses the wrapping of textures and KHR_texture_transform.
+bits of linear light, and loses the wrapping of textures and KHR_texture_transform. Skins, morph targets and sparse
+accessors are refused.
 """
 
 from __future__ import annotations
@@ -22,15 +23,14 @@ from scipy.spatial.transform import Rotation
 from ...neural_fields import InputError
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ...neural_fields.meshing.glb import GENERATOR
-from ..files import MODEST
+from ..clouds.readers.meshes import strips, triangulate
 from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-Pose = tuple[list[float], Float64]  # of a mesh: weights of its morph targets, and matrices (J, 4, 4) of joints or node
 
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # Extensions that a file may require: those that are read, and those that change the look only.
@@ -107,46 +107,35 @@ class _Document:
             raise InputError(f"{self.path}: {what}: {file} is not there; put it beside the glTF file, or export a GLB")
         return file.read_bytes()
 
-    def view(self, number: int) -> tuple[bytes, int, int]:
-        """A bufferView → its buffer, its start and its stride (0: tight)."""
+    def view(self, number: int) -> tuple[bytes, int]:
+        """The bytes of a bufferView, and its stride (0: tight)."""
         view = self.header["bufferViews"][number]
-        data, start, stride = self.buffer(view["buffer"]), _whole(view, "byteOffset"), _whole(view, "byteStride")
-        if start + _whole(view, "byteLength") > len(data):
+        data, start, length = self.buffer(view["buffer"]), _whole(view, "byteOffset"), _whole(view, "byteLength")
+        if start + length > len(data):
             raise ValueError(f"bufferViews[{number}] goes beyond the {len(data):,} bytes of its buffer")
-        return data, start, stride
+        return data[start : start + length], _whole(view, "byteStride")
 
     def accessor(self, number: int) -> NDArray[Any]:
         """An accessor → ``(count, width)``; normalised integers become fractions."""
         accessor = self.header["accessors"][number]
-        kind, width = np.dtype(_KINDS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
-        count, sparse = _whole(accessor, "count"), accessor.get("sparse")
-        if "bufferView" in accessor:
-            rows = self.rows(accessor, count, kind, width)
-        elif sparse is None or count * width * kind.itemsize > MODEST:
+        if "sparse" in accessor:
+            raise InputError(f"{self.path}: accessors[{number}]: sparse accessors are not read; export it without them")
+        if "bufferView" not in accessor:
             raise ValueError(f"accessors[{number}] has no numbers; are they compressed?")
-        else:
-            rows = np.zeros((count, width), kind)
-        if sparse is not None:
-            changed, rows = _whole(sparse, "count"), rows.copy()
-            places = self.rows(sparse["indices"], changed, np.dtype(_KINDS[sparse["indices"]["componentType"]]), 1)
-            rows[places[:, 0]] = self.rows(sparse["values"], changed, kind, width)
+        kind, width = np.dtype(_KINDS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+        data, stride = self.view(accessor["bufferView"])
+        strides = (stride or width * kind.itemsize, kind.itemsize)
+        rows = np.ndarray((_whole(accessor, "count"), width), kind, data, _whole(accessor, "byteOffset"), strides)
         if kind.kind == "f" and not np.isfinite(rows).all():
             raise ValueError(f"accessors[{number}] has a number that is not finite")
         if accessor.get("normalized", False):
             return (rows / np.float64(np.iinfo(kind).max)).clip(-1, 1)
         return rows
 
-    def rows(self, record: dict[str, Any], count: int, kind: np.dtype[Any], width: int) -> NDArray[Any]:
-        """``(count, width)`` numbers of a bufferView."""
-        data, start, stride = self.view(record["bufferView"])
-        strides = (stride or width * kind.itemsize, kind.itemsize)
-        return np.ndarray((count, width), kind, data, start + _whole(record, "byteOffset"), strides)
-
     def image(self, number: int) -> NDArray[np.float32]:
         image = self.header["images"][number]
         if "bufferView" in image:
-            data, start, _ = self.view(image["bufferView"])
-            data = data[start : start + self.header["bufferViews"][image["bufferView"]]["byteLength"]]
+            data, _ = self.view(image["bufferView"])
         else:
             data = self.resource(image["uri"], f"images[{number}]")
         try:
@@ -186,36 +175,17 @@ def _pieces(document: _Document, materials: dict[str, Paint], *, textures: bool)
             raise ValueError("a node is its own ancestor, or has two parents")
         places[number] = parent @ _transform(nodes[number], ours=ours)
         open_nodes += [(child, places[number]) for child in nodes[number].get("children", [])]
-    for node, placed in ((nodes[number], placed) for number, placed in places.items()):
-        mesh = header["meshes"][node["mesh"]] if "mesh" in node else {"primitives": []}
-        weights, joints = node.get("weights", mesh.get("weights", [])), placed[None]
-        if "skin" in node:  # whose joints place the mesh, and its node does not
-            skin = header["skins"][node["skin"]]
-            joints = np.stack([places[number] for number in skin["joints"]])
-            if "inverseBindMatrices" in skin:
-                bound = document.accessor(skin["inverseBindMatrices"])[: len(joints)]
-                joints = joints @ bound.reshape(-1, 4, 4).swapaxes(1, 2)
+    for number, placed in places.items():
+        node = nodes[number]
+        if "mesh" not in node:
+            continue
+        mesh = header["meshes"][node["mesh"]]
+        if "skin" in node or np.any(node.get("weights", mesh.get("weights", []))):
+            fix = "apply them, and export the mesh alone"
+            raise InputError(f"{document.path}: nodes[{number}]: skins and morph targets are not read; {fix}")
         for primitive in mesh["primitives"]:
             if _TRIANGLES <= primitive.get("mode", _TRIANGLES) <= _FAN and "POSITION" in primitive["attributes"]:
-                yield _piece(document, primitive, (weights, joints), materials, textures=textures)
-
-
-def _posed(document: _Document, primitive: dict[str, Any], pose: Pose) -> tuple[Float64, bool]:
-    """The vertices of a primitive in the scene, in the pose at rest, and whether it is mirrored there."""
-    attributes, (shares, joints) = primitive["attributes"], pose
-    vertices = document.accessor(attributes["POSITION"]).astype(np.float64)
-    for weight, target in zip(shares, primitive.get("targets", []), strict=False):
-        if "POSITION" in target:
-            vertices += _finite(weight, "weights") * document.accessor(target["POSITION"])
-    if "JOINTS_0" not in attributes or len(joints) == 1:
-        placed = joints[0]
-        return vertices @ placed[:3, :3].T + placed[:3, 3], bool(np.linalg.det(placed[:3, :3]) < 0)
-    sets = range(sum(name.startswith("JOINTS_") for name in attributes))
-    weights = np.hstack([document.accessor(attributes[f"WEIGHTS_{k}"]) for k in sets]).astype(np.float64)
-    used = np.hstack([document.accessor(attributes[f"JOINTS_{k}"]) for k in sets])
-    weights /= np.where(weights.any(axis=1), weights.sum(axis=1), 1)[:, None]
-    placed = np.einsum("nk,nkij->nij", weights, joints[used])
-    return np.einsum("nij,nj->ni", placed[:, :3, :3], vertices) + placed[:, :3, 3], False
+                yield _piece(document, primitive, placed, materials, textures=textures)
 
 
 def _transform(node: dict[str, Any], *, ours: bool) -> Float64:
@@ -232,10 +202,10 @@ def _transform(node: dict[str, Any], *, ours: bool) -> Float64:
 
 
 def _piece(
-    document: _Document, primitive: dict[str, Any], pose: Pose, materials: dict[str, Paint], *, textures: bool
+    document: _Document, primitive: dict[str, Any], placed: Float64, materials: dict[str, Paint], *, textures: bool
 ) -> _Piece:
     attributes = primitive["attributes"]
-    vertices, mirrored = _posed(document, primitive, pose)
+    vertices = document.accessor(attributes["POSITION"]).astype(np.float64) @ placed[:3, :3].T + placed[:3, 3]
     count = len(vertices)
     order = np.arange(count)
     if "indices" in primitive:
@@ -243,7 +213,7 @@ def _piece(
     faces = _triangles(order, primitive.get("mode", _TRIANGLES))
     if len(faces) and faces.max() >= count:
         raise ValueError(f"a face names vertex {faces.max()}, but there are only {count}")
-    if mirrored:  # a mirrored node shows the other side of its triangles
+    if np.linalg.det(placed[:3, :3]) < 0:  # a mirrored node shows the other side of its triangles
         faces = faces[:, ::-1]
     colors = None
     if "COLOR_0" in attributes:
@@ -273,11 +243,7 @@ def _base_color(material: dict[str, Any]) -> dict[str, Any]:
 def _triangles(order: Int64, mode: int) -> Int64:
     if mode == _TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
-    if mode == _FAN:
-        return np.stack((order[1:-1], order[2:], np.full(max(len(order) - 2, 0), order[0])), axis=1)
-    k = np.arange(max(len(order) - 2, 0))
-    odd = k % 2
-    return np.stack((order[k], order[k + 1 + odd], order[k + 2 - odd]), axis=1)
+    return (strips if mode == _STRIP else triangulate)(np.array([len(order)]), order)
 
 
 def _texture_coordinates(document: _Document, attributes: dict[str, int], info: dict[str, Any]) -> Float64:

@@ -75,7 +75,7 @@ def _read_ply(path: Path) -> TexturedMesh:
 
 
 def _read_gltf(path: Path) -> TexturedMesh:
-    """The triangles of a glTF scene, skins and morph targets at rest; equal vertices with equal colours are merged."""
+    """The triangles of a glTF scene; equal vertices with equal colours are merged."""
     mesh = read_gltf(path)
     colors = mesh.vertex_colors
     keys = mesh.vertices if colors is None else np.concatenate((mesh.vertices, colors), axis=1, dtype=np.float64)
