@@ -165,51 +165,41 @@ _ARRAYS = {
 
 
 def read_npz(path: Path, columns: str | None = None) -> PointCloud:
-    """``points`` (N, 3), ``normals`` and ``colors``, or other usual names; or an array for each column (``x``).
+    """``points`` (N, 3), ``normals`` and ``colors``, or other usual names.
 
     Normals are float, or int8 or int16 over their largest value.
     """
 
-    def known(name: str) -> tuple[str, ...] | None:
-        plain = re.sub(r"[\W_]", "", name).casefold()
-        return tuple(_ARRAYS[plain]) if plain in _ARRAYS else None
+    def known(name: str) -> tuple[str, ...]:
+        return tuple(_ARRAYS.get(re.sub(r"[\W_]", "", name).casefold(), ()))
 
     ignored: list[str] = []
 
     def choose(names: list[str]) -> list[str]:
         roles = [known(name) for name in names]
-        ignored[:] = [name for name, role in zip(names, roles, strict=True) if role is None]
-        chosen = [name for k, name in enumerate(names) if roles[k] is not None and roles[k] not in roles[:k]]
-        if ("x", "y", "z") in roles:
-            return chosen
-        if named_layout(names) is not None:
-            return names
-        raise InputError(f"{path}: points: no such array (there are: {', '.join(names) or 'none'}); add it")
+        if ("x", "y", "z") not in roles:
+            raise InputError(f"{path}: points: no such array (there are: {', '.join(names) or 'none'}); add it")
+        ignored[:] = [name for name, role in zip(names, roles, strict=True) if not role]
+        return [name for k, name in enumerate(names) if roles[k] and roles[k] not in roles[:k]]
 
     arrays = read_arrays(path, choose)
     if isinstance(arrays, np.ndarray):
         raise InputError(f"{path}: a single NumPy array under another name; rename it to .npy")
     names: list[str] = []
     values: list[NDArray[Any]] = []
-    first = next((array for name, array in arrays.items() if known(name) == ("x", "y", "z")), None)
-    if first is not None and (first.ndim != 2 or first.shape[1] < 3):
+    first = next(array for name, array in arrays.items() if known(name) == ("x", "y", "z"))
+    if first.ndim != 2 or first.shape[1] < 3:
         raise InputError(f"{path}: points: shape {first.shape}; expected (N, 3)")
-    if first is not None and first.shape[1] > 3 and len(arrays) == 1:
+    if first.shape[1] > 3 and len(arrays) == 1:
         table = _array_table(path, first)
         return cloud_from(table, choose_layout(table, columns))
     for name, array in arrays.items():
         numeric(array, f"{path}: {name}")
         parts = known(name)
-        if first is not None and parts is not None:
-            if len(array) != len(first) or array.ndim != 2 or array.shape[1] not in (3, 3 + (parts[0] == "r")):
-                raise InputError(f"{path}: {name}: shape {array.shape}; expected {first.shape}, one row per point")
-            names += parts
-            values += list(array.T[:3])
-        elif first is None:
-            names.append(name)
-            values.append(array.ravel())
-    if len({len(value) for value in values}) > 1:
-        raise InputError(f"{path}: its arrays have different lengths; expected one number of each per point")
-    notes = (f"ignored arrays: {', '.join(ignored)}",) * bool(ignored and first is not None)
+        if len(array) != len(first) or array.ndim != 2 or array.shape[1] not in (3, 3 + (parts[0] == "r")):
+            raise InputError(f"{path}: {name}: shape {array.shape}; expected {first.shape}, one row per point")
+        names += parts
+        values += list(array.T[:3])
+    notes = (f"ignored arrays: {', '.join(ignored)}",) * bool(ignored)
     table = Table(path, values, names, notes=notes)
     return cloud_from(table, choose_layout(table, columns))

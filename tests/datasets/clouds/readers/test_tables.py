@@ -246,7 +246,6 @@ def test_npz(tmp_path):
         ({"Points": P, "Colors": C / 255}, "c"),
         ({"points": np.hstack((P, N))}, "n"),
         ({"arr_0": np.hstack((P, N))}, "n"),
-        ({**dict(zip("xyz", P.T, strict=True)), "intensity": I[:, 0]}, ""),
     ):
         np.savez(path, **arrays)
         read = check(path, expected)
