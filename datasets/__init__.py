@@ -11,7 +11,7 @@ from .depth.cloud import DepthReport, DepthSettings, frame_cloud, fuse_frames
 from .depth.frame import RgbdFrame, read_frame, read_poses
 from .depth.images import read_color, read_depth
 from .files import is_depth_file
-from .synthetic.samples import add_isotropic_noise, add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
+from .synthetic.samples import add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
 from .synthetic.scanner import STATUE_PLACEMENT, ScanFaults, SimulatedScan, scan_with_truth, simulate_scan, statue_scan
 from .synthetic.scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
 from .synthetic.statue import Statue
@@ -23,7 +23,7 @@ from .views.writing import write_colmap, write_neus, write_transforms
 __all__ = [
     "SCENES", "STATUE_PLACEMENT", "Camera", "CleaningReport", "DepthCamera", "DepthReport", "DepthSettings",
     "OrientedCloud", "PointCloud", "PosedImage", "PosedImages", "RgbdFrame", "ScanFaults", "Scene", "SimulatedScan",
-    "Statue", "TexturedMesh", "add_isotropic_noise", "add_noise", "add_outliers", "colors_at", "frame_cloud",
+    "Statue", "TexturedMesh", "add_noise", "add_outliers", "colors_at", "frame_cloud",
     "fuse_frames", "is_depth_file", "linear_to_srgb", "look_at", "orbit", "prepare_cloud", "read_cameras",
     "read_cloud", "read_color", "read_depth", "read_frame", "read_intrinsics", "read_posed_images", "read_poses",
     "read_textured", "region_from_cameras", "region_from_masks", "region_from_points",

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from mplicits.datasets import Camera, OrientedCloud, PointCloud, add_isotropic_noise, add_noise, orbit, read_cloud
+from mplicits.datasets import Camera, OrientedCloud, PointCloud, add_noise, orbit, read_cloud
 from mplicits.datasets.synthetic.statue import Statue
 from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Similarity, load_field
 from mplicits.neural_fields.backend.devices import peak_memory
@@ -296,7 +296,7 @@ def clouds_of(
         cloud = PointCloud(drawn, normals.astype(np.float32), None, str(path))
     if not noise:
         return cloud, cloud
-    return cloud, (add_isotropic_noise if isotropic else add_noise)(cloud, noise, seed=seed)
+    return cloud, add_noise(cloud, noise, isotropic=isotropic, seed=seed)
 
 
 def timed_mesh(run: Run, resolution: int, level: int = -1) -> tuple[Mesh | None, float]:

@@ -110,36 +110,23 @@ def sample_torus(count: int, *, major: float = 0.5, minor: float = 0.2, seed: in
     return PointCloud(major * radial + minor * normals, normals.astype(np.float32), None, "torus")
 
 
-def add_noise(cloud: PointCloud, amplitude: float, *, seed: int = 0) -> PointCloud:
+def add_noise(cloud: PointCloud, amplitude: float, *, isotropic: bool = False, seed: int = 0) -> PointCloud:
     """Move points along their normals by U(-1, 1)·``amplitude``·(diagonal of the bounding box); normals stay.
 
-    The paper's noise is ``amplitude=0.01``.
+    The paper's noise is ``amplitude=0.01``. With ``isotropic``, each coordinate is moved by N(0, σ²) with σ =
+    ``amplitude``·diagonal/√3, which is as strong along any direction.
 
     Raises:
-        ValueError: the cloud has no normals, or ``amplitude`` is negative.
+        ValueError: the cloud has no normals to move its points along, or ``amplitude`` is negative.
     """
-    if cloud.normals is None:
+    if cloud.normals is None and not isotropic:
         raise ValueError(f"cloud={cloud.source!r} has no normals to move its points along; prepare it first")
     if not amplitude >= 0:
         raise ValueError(f"amplitude={amplitude}: expected a fraction of the diagonal, 0 or more")
-    diagonal = float(np.linalg.norm(np.ptp(cloud.points, axis=0)))
-    shift = np.random.default_rng(seed).uniform(-1, 1, (len(cloud), 1)) * amplitude * diagonal
-    return replace(cloud, points=cloud.points + shift * unit_rows(cloud.normals))
-
-
-def add_isotropic_noise(cloud: PointCloud, amplitude: float, *, seed: int = 0) -> PointCloud:
-    """Move points by N(0, σ²) in each coordinate, σ = ``amplitude``·(diagonal of the bounding box)/√3; normals stay.
-
-    Along any direction, this is as strong as `add_noise` along the normals.
-
-    Raises:
-        ValueError: ``amplitude`` is negative.
-    """
-    if not amplitude >= 0:
-        raise ValueError(f"amplitude={amplitude}: expected a fraction of the diagonal, 0 or more")
-    sigma = amplitude * float(np.linalg.norm(np.ptp(cloud.points, axis=0))) / 3**0.5
-    shift = np.random.default_rng(seed).normal(0, sigma, cloud.points.shape)
-    return replace(cloud, points=cloud.points + shift)
+    random, size = np.random.default_rng(seed), amplitude * float(np.linalg.norm(np.ptp(cloud.points, axis=0)))
+    if cloud.normals is None or isotropic:
+        return replace(cloud, points=cloud.points + random.normal(0, size / 3**0.5, cloud.points.shape))
+    return replace(cloud, points=cloud.points + random.uniform(-size, size, (len(cloud), 1)) * unit_rows(cloud.normals))
 
 
 def add_outliers(cloud: PointCloud, fraction: float, *, seed: int = 0) -> PointCloud:

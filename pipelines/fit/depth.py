@@ -35,7 +35,7 @@ from ..training.folder import CLOUD_FILE, kept_cloud, read_record
 from ..training.result import Run
 from ..training.settings import FitConfig
 from ..training.trainer import Report
-from .train import fit, fit_moved
+from .train import fit, fit_file
 
 T = TypeVar("T")
 
@@ -130,7 +130,7 @@ def fit_depth(
     made = partial_of(out / CLOUD_FILE)  # an older cloud stays until the first checkpoint
     try:
         write_cloud_ply(made, cloud)
-        return fit_moved(made, config, out=out, name=CLOUD_FILE, progress=progress)
+        return fit_file(made, config, out=out, keep=CLOUD_FILE, progress=progress)
     finally:
         made.unlink(missing_ok=True)
 

@@ -19,7 +19,7 @@ from ..training.progress import format_table
 from ..training.settings import FitConfig, load_config
 from ..training.trainer import Progress, Report
 from .cloud import Surroundings
-from .train import fit_part
+from .train import fit_file
 
 SETTINGS_FILE = "fits.json"  # in the directory of all runs: the settings of those yet to begin
 
@@ -102,7 +102,7 @@ def fit_job(job: FitJob, progress: Report | None = None) -> dict[str, Any]:
         return read_record(job.directory)
     resume = job.resume and (job.directory / STATE_FILE).is_file()
     about = {"resume": resume, "around": job.around, "progress": progress}
-    return fit_part(job.cloud, job.config, out=job.directory, **about).record
+    return fit_file(job.cloud, job.config, out=job.directory, **about).record
 
 
 def _named(progress: Callable[[str, Progress], None], name: str) -> Report:

@@ -78,26 +78,25 @@ def fit(
     return _fit(RunFolder(out, resume=resume), cloud, config, progress=progress, level_done=level_done)
 
 
-def fit_moved(
-    file: Path, config: FitConfig, *, out: Path, name: str, progress: Report | None = None
-) -> Run[MultiscaleSDF]:
-    """`fit` a cloud file that was made for the run; the run directory keeps a copy of it as ``name``."""
-    folder = RunFolder(out)
-    folder.keep(name, file.read_bytes())
-    return _fit(folder, file, config, source=str(out / name), progress=progress)
-
-
-def fit_part(
-    cloud: Path,
+def fit_file(
+    file: Path,
     config: FitConfig,
     *,
     out: Path,
     resume: bool = False,
+    keep: str | None = None,
     around: Surroundings | None = None,
     progress: Report | None = None,
 ) -> Run[MultiscaleSDF]:
-    """`fit` a part of a cloud; what lies ``around`` it decides with it where inside is."""
-    return _fit(RunFolder(out, resume=resume), cloud, config, around=around, progress=progress)
+    """`fit` a cloud file that was made for the run, which may ``keep`` a copy of it by that name.
+
+    What lies ``around`` it, if it is a part of a cloud, decides with it where inside is.
+    """
+    folder = RunFolder(out, resume=resume)
+    if keep is not None:
+        folder.keep(keep, file.read_bytes())
+    source = None if keep is None else str(out / keep)
+    return _fit(folder, file, config, source=source, around=around, progress=progress)
 
 
 def _fit(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
 
 from ...datasets.cameras import Camera
@@ -121,32 +122,20 @@ def _wire_sphere(*, meridians: int = 6, parallels: int = 5, sides: int = 64) -> 
 
 def _tubes(segments: Float64, radius: float, color: Rgb | Float64) -> Mesh:
     """Three-sided tubes along segments ``(S, 2, 3)``, closed at both ends."""
-    along = segments[:, 1] - segments[:, 0]
-    along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
-    # Of the three axes, the one least along the segment is a safe start for the two directions across it.
-    side = np.cross(along, np.eye(3)[np.abs(along).argmin(axis=1)])
-    side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12)
-    other = np.cross(along, side)
-    angle = 2 * np.pi * np.arange(3) / 3
-    rim = np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * other[:, None]  # (S, 3, 3)
-    vertices = segments[:, :, None] + radius * rim[:, None]  # (S, 2, 3, 3)
-    walls = [face for k in range(3) for face in ((k, (k + 1) % 3, 3 + k), ((k + 1) % 3, 3 + (k + 1) % 3, 3 + k))]
-    return _copies(vertices.reshape(-1, 6, 3), [*walls, (2, 1, 0), (3, 4, 5)], color)
+    tubes = [trimesh.creation.cylinder(radius, segment=segment, sections=3) for segment in segments]
+    return _painted(trimesh.util.concatenate(tubes), color)
 
 
 def _octahedra(points: Float64, radius: float, color: Rgb) -> Mesh:
-    tips = radius * np.concatenate((np.eye(3), -np.eye(3)))
-    upper = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2)]
-    lower = [(1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
-    return _copies(points[:, None] + tips, upper + lower, color)
+    one = trimesh.convex.convex_hull(radius * np.concatenate((np.eye(3), -np.eye(3))))
+    vertices = (points[:, None] + one.vertices).reshape(-1, 3)
+    faces = (one.faces + len(one.vertices) * np.arange(len(points))[:, None, None]).reshape(-1, 3)
+    return _painted(trimesh.Trimesh(vertices, faces, process=False), color)
 
 
-def _copies(vertices: Float64, faces: Sequence[tuple[int, int, int]], color: Rgb | Float64) -> Mesh:
-    """One mesh of N alike: vertices ``(N, K, 3)``, and the faces of each."""
-    count, corners, _ = vertices.shape
-    numbers = np.array(faces)[None] + corners * np.arange(count)[:, None, None]
-    colors = np.broadcast_to(np.asarray(color, np.float64), (count * corners, 3))
-    return Mesh(vertices.reshape(-1, 3), numbers.reshape(-1, 3), colors=colors)
+def _painted(mesh: trimesh.Trimesh, color: Rgb | Float64) -> Mesh:
+    vertices = np.asarray(mesh.vertices)
+    return Mesh(vertices, np.asarray(mesh.faces), colors=np.tile(np.asarray(color, np.float64), (len(vertices), 1)))
 
 
 def _joined(parts: Sequence[Mesh]) -> Mesh:

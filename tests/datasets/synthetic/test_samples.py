@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits import datasets
-from mplicits.datasets import Statue, add_isotropic_noise, add_noise, sample_sphere, sample_surface, sample_torus
+from mplicits.datasets import Statue, add_noise, sample_sphere, sample_surface, sample_torus
 from mplicits.neural_fields import Box, Capsule, Sphere, Torus
 from scipy.ndimage import label
 from scipy.spatial import KDTree
@@ -52,7 +52,7 @@ def test_noise_moves_points_along_their_normals():
 def test_isotropic_noise_is_as_strong_along_the_normals_and_across():
     """Of a Gaussian the covariances' standard errors are σ² √((1 + δ_ij)/N); five of them are allowed."""
     cloud = sample_sphere(20000, radius=1.0)
-    noisy = add_isotropic_noise(cloud, 0.01, seed=1)
+    noisy = add_noise(cloud, 0.01, seed=1, isotropic=True)
     sigma = 0.01 * np.linalg.norm(np.ptp(cloud.points, axis=0)) / 3**0.5
     shift = noisy.points - cloud.points
     bound = 5 * sigma**2 * np.sqrt((1 + np.eye(3)) / 20000)
@@ -61,7 +61,7 @@ def test_isotropic_noise_is_as_strong_along_the_normals_and_across():
     assert abs(along - sigma**2) < 5 * sigma**2 * (2 / 20000) ** 0.5
     assert noisy.normals is cloud.normals
     with pytest.raises(ValueError, match="amplitude=-1"):
-        add_isotropic_noise(cloud, -1)
+        add_noise(cloud, -1, isotropic=True)
 
 
 def test_outliers_fill_the_ball():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from mplicits.datasets import (
     PointCloud,
-    add_isotropic_noise,
     add_noise,
     prepare_cloud,
     sample_sphere,
@@ -172,7 +171,7 @@ def test_points_that_smoothing_took_to_the_wrong_place_are_dropped():
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_points_are_set_apart_with_their_noise(noise):
     clean = sample_sphere(6000)
-    cloud = add_isotropic_noise(clean, noise)
+    cloud = add_noise(clean, noise, isotropic=True)
     rank = np.arange(6000)  # of each point, as its colour
     colors = np.stack((rank / 6000, np.zeros(6000), np.zeros(6000)), axis=1).astype(np.float32)
     prepared = prepare_cloud(PointCloud(cloud.points, None, colors), smooth_noise=True, noisy=300)
