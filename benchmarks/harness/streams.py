@@ -7,7 +7,7 @@ from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 
 import torch
 from mplicits.pipelines.training.jobs import Item, Outcome, Result, outcome_of
-from mplicits.pipelines.training.trainer import Interrupted, shared_flag, stop_on_signals
+from mplicits.pipelines.training.trainer import SHARED_FLAG, Interrupted, stop_on_signals
 
 
 def run_streams(
@@ -37,8 +37,8 @@ def run_streams(
         def work(item: Item) -> Outcome[Item, Result]:
             if flag.requested:
                 raise Interrupted(None)
-            with shared_flag(flag):
-                return outcome_of(function, item)
+            SHARED_FLAG.set(flag)
+            return outcome_of(function, item)
 
         waiting = {threads.submit(work, item): index for index, item in enumerate(items)}
         while waiting:

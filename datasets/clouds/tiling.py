@@ -7,12 +7,11 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...neural_fields import InputError
+from ...neural_fields.fields.tiled import Split
 from .large import Survey, survey, usable_pieces
 from .point_cloud import Float64, Int64
 from .readers.columns import CloudStream
@@ -32,24 +31,12 @@ class TilingOptions:
 TILING = TilingOptions()
 
 
-class Cut(NamedTuple):
-    """A plane of the tree: ``axis``, its ``place`` in input coordinates, and what lies ``below`` and ``above`` it.
-
-    These are rows of the list of cuts; −1 − i is tile i.
-    """
-
-    axis: int
-    place: float
-    below: int
-    above: int
-
-
 @dataclass(frozen=True)
 class TilePlan:
     """Boxes of a cloud, in input coordinates and units.
 
     Attributes:
-        cuts: the tree, from its root; none for a single tile.
+        cuts: the tree of planes, from its root; none for a single tile.
         blend: half the width of the blend between two tiles, and the reach of their distances.
         low: ``(3,)`` lowest corner of the points.
         high: ``(3,)`` highest corner.
@@ -57,10 +44,10 @@ class TilePlan:
         normals: whether they have normals.
     """
 
-    cuts: tuple[Cut, ...]
+    cuts: tuple[Split, ...]
     blend: float
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
     count: int
     normals: bool
 
@@ -68,22 +55,6 @@ class TilePlan:
     def num_tiles(self) -> int:
         """The number of tiles."""
         return 1 + len(self.cuts)
-
-    def boxes(self, *, margin: float) -> list[tuple[Float64, Float64]]:
-        """Lowest and highest corner of each tile's box, wider by ``margin``; infinite where nothing lies beyond."""
-        found = [(np.full(3, -np.inf), np.full(3, np.inf)) for _ in range(self.num_tiles)]
-
-        def walk(node: int, low: Float64, high: Float64) -> None:
-            if node < 0:
-                found[-1 - node] = (low - margin, high + margin)
-                return
-            cut = self.cuts[node]
-            axis = np.arange(3) == cut.axis
-            walk(cut.below, low, np.where(axis, cut.place, high))
-            walk(cut.above, np.where(axis, cut.place, low), high)
-
-        walk(0 if self.cuts else -1, *found[0])
-        return found
 
     def rows(self, points: Float64, *, margin: float) -> Iterator[tuple[int, Int64]]:
         """Each tile with the rows of the points ``(N, 3)`` in its box and up to ``margin`` beside it."""
@@ -120,8 +91,8 @@ def plan_tiles(stream: CloudStream, *, size: float | None = None, points: int | 
         usual = math.sqrt(max(middle, longest / 100) * longest / max(1.0, frame.finite / limit))
     else:
         usual = size
-    narrowest = TILING.narrowest * usual
-    cuts: list[Cut] = []
+    narrowest, blend = TILING.narrowest * usual, TILING.blend * usual
+    cuts: list[Split] = []
     tiles = 0
 
     def cut(rows: Int64, low: Float64, high: Float64) -> int:
@@ -138,23 +109,18 @@ def plan_tiles(stream: CloudStream, *, size: float | None = None, points: int | 
             if min(below.sum(), (~below).sum()) * each < TILING.fewest:
                 continue
             number = len(cuts)
-            cuts.append(Cut(int(axis), place, 0, 0))
+            cuts.append(Split(int(axis), place, blend, 0, 0))
             beside = np.arange(3) == axis
             first = cut(rows[below], low, np.where(beside, place, high))
             second = cut(rows[~below], np.where(beside, place, low), high)
-            cuts[number] = Cut(int(axis), place, first, second)
+            cuts[number] = Split(int(axis), place, blend, first, second)
             return number
         tiles += 1
         return -tiles
 
     cut(np.arange(len(sample)), low, high)
-    plan = TilePlan(tuple(cuts), TILING.blend * usual, _triple(low), _triple(high), frame.finite, frame.normals)
+    plan = TilePlan(tuple(cuts), blend, tuple(low.tolist()), tuple(high.tolist()), frame.finite, frame.normals)
     return plan, frame
-
-
-def _triple(numbers: NDArray[np.floating]) -> tuple[float, float, float]:
-    x, y, z = (float(number) for number in numbers)
-    return x, y, z
 
 
 def write_tiles(

@@ -1,6 +1,7 @@
 """Wavefront OBJ with its materials: faces, texture coordinates of corners, MTL files and their images.
 
-A material's colour is ``map_Kd``, or else ``Kd``; both are display colours. trimesh splits vertices at seams.
+A material's colour is ``map_Kd``, or else ``Kd``; both are display colours. Options of ``map_Kd`` are refused. trimesh
+splits vertices at seams.
 """
 
 from __future__ import annotations
@@ -13,25 +14,17 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ..clouds.readers.meshes import ObjText, triangulate
-from ..clouds.readers.tables import is_number
 from ..files import decoded
-from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
+from .mesh import Paint, TexturedMesh, decode_texture, pack
 
 Float64 = NDArray[np.float64]
 
-# Options of map_Kd, each with the largest number of words that follow.
-_OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1, "-clamp": 1}
-_OPTIONS |= {"-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1}
-
 
 class _Material(NamedTuple):
-    """The colour of a material, or its image at ``uv * scale + offset``."""
+    """The colour of a material, or its image."""
 
     color: tuple[float, ...] = (1.0, 1.0, 1.0)
     image: Path | None = None
-    clamp: bool = False
-    scale: tuple[float, ...] = (1.0, 1.0)
-    offset: tuple[float, ...] = (0.0, 0.0)
 
 
 def read_textured_obj(path: Path) -> TexturedMesh:
@@ -65,10 +58,9 @@ def read_textured_obj(path: Path) -> TexturedMesh:
     mapped[triangles[painted]] = True
     if mapped.any():
         uv[mapped] = _texture_coordinates(obj, mapped)
-    scale, offset = (np.array([material[k] for material in listed])[chosen][:, None] for k in (3, 4))
     some, chosen = np.unique(chosen % len(listed), return_inverse=True)
     image, parts = pack([_paint(listed[k]) for k in some], chosen)
-    return TexturedMesh(points, faces, uv[triangles] * scale + offset, image, None, str(path), parts)
+    return TexturedMesh(points, faces, uv[triangles], image, None, str(path), parts)
 
 
 def _texture_coordinates(obj: ObjText, mapped: NDArray[np.bool_]) -> Float64:
@@ -113,7 +105,12 @@ def _read_mtl(file: Path) -> dict[str, _Material]:
         elif name is not None and keyword == "Kd":
             found[name] = found[name]._replace(color=_color(rest, file, name))
         elif name is not None and keyword.lower() == "map_kd":
-            found[name] = _with_map(found[name], rest, file, name)
+            if rest.startswith("-"):
+                raise InputError(f"{file}: {name}: map_Kd: the option {rest.split()[0]} is not read; export without it")
+            image = _beside(file, rest)  # whose name may hold spaces
+            if not image.is_file():
+                raise InputError(f"{file}: {name}: map_Kd: {image} is not there; put the image beside the MTL file")
+            found[name] = found[name]._replace(image=image)
     return found
 
 
@@ -127,28 +124,6 @@ def _color(words: str, file: Path, name: str) -> tuple[float, ...]:
     return tuple(min(max(part, 0.0), 1.0) for part in color) * (3 // len(color))
 
 
-def _with_map(material: _Material, words: str, file: Path, name: str) -> _Material:
-    """Read ``map_Kd [options] file``; the file's name may hold spaces."""
-    left = words.split(" ")
-    while left and left[0] in _OPTIONS:
-        option, values, left = left[0], [], left[1:]
-        while left[1:] and len(values) < _OPTIONS[option] and (not values or is_number(left[0])):
-            values.append(left.pop(0))
-        if option in ("-s", "-o") and values and is_number(values[0]):
-            default = (1.0, 1.0) if option == "-s" else (0.0, 0.0)
-            pair = (*map(float, values[:2]), *default[len(values[:2]) :])
-            if not np.isfinite(pair).all():
-                raise InputError(f"{file}: {name}: map_Kd: {option} has a number that is not finite; export it again")
-            material = material._replace(scale=pair) if option == "-s" else material._replace(offset=pair)
-        elif option == "-clamp":
-            material = material._replace(clamp=values == ["on"])
-    named = " ".join(left)
-    image = _beside(file, named)
-    if not image.is_file():
-        raise InputError(f"{file}: {name}: map_Kd: {image} is not there; put the image beside the MTL file")
-    return material._replace(image=image)
-
-
 def _beside(file: Path, name: str) -> Path:
     """A file named in another one, at its path or else beside it."""
     name = name.strip().strip('"').replace("\\", "/")
@@ -159,8 +134,7 @@ def _beside(file: Path, name: str) -> Path:
 def _paint(material: _Material) -> Paint:
     if material.image is None:
         return Paint(np.array(material.color, np.float32).reshape(1, 1, 3))
-    wrap: Wrap = "clamp" if material.clamp else "repeat"
     try:
-        return Paint(decode_texture(material.image.read_bytes()), (wrap, wrap))
+        return Paint(decode_texture(material.image.read_bytes()))
     except ValueError as error:
         raise InputError(f"{material.image}: {error}; save it as PNG or JPEG") from error

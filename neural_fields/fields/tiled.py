@@ -211,7 +211,3 @@ class TiledField(Gated):
         """Move the bands, and forget the tiles, which are loaded onto the new device."""
         self._open.clear()
         return super()._apply(fn, recurse)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the loaded tiles."""
-        return self.__dict__ | {"_open": OrderedDict()}

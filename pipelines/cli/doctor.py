@@ -7,9 +7,6 @@ import importlib.util
 import os
 import platform
 import re
-import shlex
-import subprocess
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,10 +44,8 @@ def examine(folder: Path | None = None) -> list[Finding]:
     python = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     return [
         Finding("ok", "Python", python),
-        _start(),
         *(_requirement(line) for line in asked),
         _cv2(),
-        *_torchvision(),
         _threads(),
         _cuda(),
         _kernels(),
@@ -66,16 +61,6 @@ def format_findings(findings: list[Finding]) -> str:
     errors, warnings = (sum(finding.level == level for finding in findings) for level in ("error", "warning"))
     verdict = f"{errors} errors: see above" if errors else "all that is needed is here"
     return "\n".join([*lines, verdict + f"; {warnings} warnings" * bool(warnings)])
-
-
-def _start() -> Finding:
-    """Whether Python has kept what it compiled of PyTorch; containers often forbid it, and each start then does it."""
-    kept = Path(importlib.util.cache_from_source(torch.__file__))
-    if kept.exists():
-        return Finding("ok", "start", "PyTorch is compiled to bytecode")
-    fix = shlex.join([sys.executable, "-m", "compileall", "-q", str(Path(torch.__file__).parent)])
-    what = f"Python compiles PyTorch anew each time ({kept} is missing); {fix}, and every command starts seconds sooner"
-    return Finding("warning", "start", what)
 
 
 def _installed(name: str) -> str | None:
@@ -117,20 +102,6 @@ def _cv2() -> Finding:
         fix = f"pip uninstall {names} {OWN_CV2}, then pip install {OWN_CV2}"
         return Finding("warning", "cv2", f"{names} and {OWN_CV2} overwrite each other's files; {fix}")
     return Finding("ok", "cv2", "one wheel only")
-
-
-def _torchvision() -> list[Finding]:
-    """nerfstudio's; its operators are compiled for one build of torch, and from two indexes pip takes two builds."""
-    version = _installed("torchvision")
-    if version is None:
-        return []
-    asked = subprocess.run([sys.executable, "-c", "import torchvision"], capture_output=True, text=True, check=False)
-    if asked.returncode:
-        why, fix = asked.stderr.strip().splitlines()[-1], "install both from one index, PyPI or PyTorch's"
-        return [
-            Finding("warning", "torchvision", f"{version} does not work with torch {torch.__version__} ({why}); {fix}")
-        ]
-    return [Finding("ok", "torchvision", f"{version}, made for this torch")]
 
 
 def _threads() -> Finding:

@@ -176,7 +176,7 @@ def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
             arguments.out,
             jobs=jobs,
             progress=None if show is None else lambda name, step: show(replace(step, stage=f"{name} {step.stage}")),
-            report=None if arguments.quiet or jobs == 1 else _tell_outcome,
+            report=None if arguments.quiet or jobs == 1 else _Tally(len(planned)),
         )
     print(format_fits(outcomes))
     return int(any(outcome.error is not None for outcome in outcomes))
@@ -205,14 +205,13 @@ def _fit_tiles(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     with training(f"to continue: {again}", quiet=arguments.quiet, at_any_time=True) as show:
         report = show or (lambda _: None)
         job = plan_fit(cloud, arguments.out, config, size=arguments.tile_size, resume=arguments.resume, report=report)
-        tally = _Tally(job.plan.num_tiles, quiet=arguments.quiet)
         alone = show is not None and jobs == 1 and arguments.ray_address is None
         run = fit_tiles(
             job,
             jobs=jobs,
             address=arguments.ray_address,
             progress=(lambda name, step: report(replace(step, stage=f"tile {name} {step.stage}"))) if alone else None,
-            report=tally,
+            report=None if arguments.quiet else _Tally(job.plan.num_tiles),
         )
     print(describe(arguments.out))
     if run.record["seams"]["opposed"]:
@@ -224,26 +223,20 @@ def _fit_tiles(arguments: argparse.Namespace, config: FitConfig | None) -> int:
 
 
 class _Tally:
-    """Says how many tiles are fitted, and how long the others will take."""
+    """Says what became of each fit, and how long the others will take."""
 
-    def __init__(self, total: int, *, quiet: bool) -> None:
-        self.total, self.quiet, self.done, self.started = total, quiet, 0, time.monotonic()
+    def __init__(self, total: int) -> None:
+        self.total, self.done, self.started = total, 0, time.monotonic()
 
     def __call__(self, outcome: FitOutcome) -> None:
-        """Count one tile."""
+        """Count one fit."""
         from ..training.progress import time_words
 
         self.done += 1
-        left = (time.monotonic() - self.started) / self.done * (self.total - self.done)
-        result = "fitted" if outcome.error is None else outcome.error
-        if not self.quiet or outcome.error is not None:
-            name = outcome.item.directory.name
-            print(f"tile {name}: {result}; {self.done} of {self.total}, about {time_words(left)} left", file=sys.stderr)
-
-
-def _tell_outcome(outcome: FitOutcome) -> None:
-    result = "fitted" if outcome.error is None else outcome.error
-    print(f"{outcome.item.cloud}: {result}, after {outcome.seconds:.1f} s", file=sys.stderr)
+        left = time_words((time.monotonic() - self.started) / self.done * (self.total - self.done))
+        result = f"fitted after {outcome.seconds:.1f} s" if outcome.error is None else outcome.error
+        place = f"{self.done} of {self.total}" + f", about {left} left" * (self.done < self.total)
+        print(f"{outcome.item.cloud.stem}: {result}; {place}", file=sys.stderr)
 
 
 def _depth_input(arguments: argparse.Namespace, cloud: str) -> DepthInput | None:
@@ -345,18 +338,14 @@ def _describe_field(path: Path) -> Rows:
 def _describe_tiles(record: dict[str, Any]) -> Rows:
     tiles, seams, memory = record["tiles"], record["seams"], record["peak_memory"]
     errors = [tile["rms_at_points"] for tile in tiles]
-    rows: Rows = [
+    apart = f"{seams['typical']:.3g} input units apart (median; at most {seams['gap']:.3g})"
+    turned = sum(tile["sign"] < 0 for tile in tiles)
+    return [
         ("tiles", f"{len(tiles):,}, {record['parameters']:,} parameters in all"),
         ("  errors", f"rms at the points {min(errors):.3g} to {max(errors):.3g} input units"),
-        (
-            "where they meet",
-            f"{seams['typical']:.3g} input units apart in the median, {seams['gap']:.3g} at most; blended over "
-            f"{seams['overlap']:.3g}",
-        ),
+        ("  seams", f"{apart}, blended over {seams['overlap']:.3g}" + f"; {turned} tiles turned" * (turned > 0)),
+        ("  memory", "?" if memory is None else f"{memory / 2**20:,.0f} MiB at most for one tile"),
     ]
-    if turned := sum(tile["sign"] < 0 for tile in tiles):
-        rows.append(("turned", f"{turned} tiles were inside out"))
-    return rows + ([("peak memory", f"{memory / 2**20:,.0f} MiB for one tile")] if memory else [])
 
 
 def _describe_level(level: Any, stage: dict[str, Any]) -> str:

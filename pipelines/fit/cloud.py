@@ -22,6 +22,7 @@ from ...datasets.clouds.cleaning.winding import DipoleField
 from ...datasets.clouds.large import Merging, merge_cloud
 from ...datasets.clouds.readers.columns import CloudStream, MemoryStream
 from ...datasets.clouds.readers.reading import check_cloud, open_stream
+from ...datasets.clouds.tiling import TilePlan
 from ...neural_fields import Similarity
 from ...neural_fields.backend.files import whole_file
 from ..training.folder import MERGED_FILE
@@ -80,7 +81,7 @@ def load_cloud(
         return stream.cloud if isinstance(stream, MemoryStream) else read(stream.source), None
     about = None
     if not isinstance(cloud, PointCloud):
-        about = _about(Path(cloud), limit=limit, isolation=isolation, columns=columns, drop_noise=drop_noise)
+        about = file_facts(Path(cloud), limit=limit, isolation=isolation, columns=columns, drop_noise=drop_noise)
     kept = None if cache is None or about is None else _kept(cache / MERGED_FILE, about)
     if kept is not None:
         return kept
@@ -94,11 +95,11 @@ def load_cloud(
     return merged
 
 
-def _about(path: Path, **options: Any) -> dict[str, Any]:
-    """What a merged cloud depends on."""
+def file_facts(path: Path, **options: Any) -> dict[str, Any]:
+    """What a merged cloud, or a plan of tiles, depends on."""
     facts = path.stat()
     return {
-        "version": 2,  # of the merging: clouds merged by other versions are made again
+        "version": 2,  # of merging and tiling: what other versions made is made again
         "file": str(path.absolute()),
         "bytes": facts.st_size,
         "changed": facts.st_mtime_ns,
@@ -272,19 +273,19 @@ class CloudDistance:
 
 
 class Surroundings(NamedTuple):
-    """A file of what lies around a part of a cloud, ``(N, 6)``: points, and outward normals times areas, as the input.
+    """A file of what lies around tile ``number`` of a plan: ``(N, 6)`` points, and outward normals times areas.
 
-    Those in the box of the part, from ``low`` to ``high``, are left out.
+    They are means of the whole cloud, in input coordinates; those that the tile has points of are left out.
     """
 
     file: Path
-    low: tuple[float, ...]
-    high: tuple[float, ...]
+    plan: TilePlan
+    number: int
 
     def dipoles(self, similarity: Similarity) -> DipoleField | None:
-        """Their winding number in the part's coordinates; None where there is nothing."""
+        """Their winding number in the tile's coordinates; None where there is nothing."""
         rows = np.load(self.file)
-        rows = rows[((rows[:, :3] < self.low) | (rows[:, :3] > self.high)).any(axis=1)]
+        rows = np.delete(rows, dict(self.plan.rows(rows[:, :3], margin=2 * self.plan.blend))[self.number], axis=0)
         if not len(rows):
             return None
         dipoles = rows[:, 3:] / similarity.scale**2

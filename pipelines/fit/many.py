@@ -12,7 +12,7 @@ from typing import Any
 
 from ...datasets.clouds.readers.reading import check_cloud_path
 from ...neural_fields import InputError
-from ...neural_fields.backend.files import write_json
+from ...neural_fields.backend.files import damage, write_json
 from ..training.folder import STATE_FILE, check_new_run, is_fitted, read_record
 from ..training.jobs import Outcome, check_jobs, run_jobs
 from ..training.progress import format_table
@@ -77,9 +77,21 @@ def fit_many(
     out.mkdir(parents=True, exist_ok=True)
     if planned:
         _keep_settings(out, planned[0].config)
-    if jobs > 1 or progress is None:
-        return run_jobs(fit_job, planned, jobs=jobs, report=report)
-    return run_jobs(lambda job: fit_job(job, _named(progress, job.cloud.stem)), planned, report=report)
+    return run_fits(planned, jobs=jobs, progress=progress, report=report)
+
+
+def run_fits(
+    planned: Sequence[FitJob],
+    *,
+    jobs: int,
+    address: str | None = None,
+    progress: Callable[[str, Progress], None] | None = None,
+    report: Callable[[FitOutcome], None] | None = None,
+) -> list[FitOutcome]:
+    """See `fit_many`, and `run_jobs` for the ``address``; fits whose worker dies go on, twice at most."""
+    if jobs > 1 or address is not None or progress is None:
+        return run_jobs(_fit, planned, jobs=jobs, address=address, retries=2, report=report)
+    return run_jobs(lambda job: _fit(job, _named(progress, job.cloud.stem)), planned, report=report)
 
 
 def format_fits(outcomes: Sequence[FitOutcome]) -> str:
@@ -96,7 +108,7 @@ def format_fits(outcomes: Sequence[FitOutcome]) -> str:
     return format_table(("cloud", "points", "rms at points", "time", "run"), rows)
 
 
-def fit_job(job: FitJob, progress: Report | None = None) -> dict[str, Any]:
+def _fit(job: FitJob, progress: Report | None = None) -> dict[str, Any]:
     """Fit one cloud, or resume it → its record."""
     if job.resume and is_fitted(job.directory):
         return read_record(job.directory)
@@ -114,10 +126,15 @@ def _keep_settings(out: Path, config: FitConfig) -> None:
 
 
 def _kept_settings(out: Path) -> FitConfig:
-    path = out / SETTINGS_FILE
-    try:
-        return load_config(FitConfig, None, json.loads(path.read_text(encoding="utf-8"))["config"])
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file, so there is nothing to resume; leave out --resume") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: damaged ({error}); begin again without --resume") from error
+    return load_config(FitConfig, None, read_kept(out / SETTINGS_FILE)["config"])
+
+
+def read_kept(path: Path) -> dict[str, Any]:
+    """The JSON of a file that tells how to resume; InputError if there is none, or it is damaged."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file, so there is nothing to resume; leave out --resume")
+    with damage(path, "begin again without --resume"):
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(kept["config"], dict):
+            raise TypeError("config is not a mapping")
+        return kept

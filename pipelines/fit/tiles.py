@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 import time
 from collections.abc import Callable
@@ -20,27 +19,26 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from ...datasets.clouds.large import merge_cloud
 from ...datasets.clouds.readers.columns import CloudStream, MemoryStream
 from ...datasets.clouds.readers.reading import check_cloud_path, open_stream, read_cloud
-from ...datasets.clouds.tiling import Cut, TilePlan, plan_tiles, tile_name, write_tiles
+from ...datasets.clouds.tiling import TilePlan, plan_tiles, tile_name, write_tiles
 from ...neural_fields import InputError, Similarity, load_field
-from ...neural_fields.backend.files import check_place, write_json
+from ...neural_fields.backend.files import check_place, damage, write_json
 from ...neural_fields.checkpoint import TileFiles
 from ...neural_fields.fields.tiled import Split, TiledField
 from ..surface.surface import read_support
 from ..training.folder import FIELD_FILE, RunFolder, find_field, is_fitted, read_record
-from ..training.jobs import check_jobs, run_jobs
-from ..training.progress import reported, silent
+from ..training.jobs import check_jobs
+from ..training.progress import counted, reported, silent
 from ..training.result import Run
 from ..training.scaffold import environment
 from ..training.settings import FitConfig, load_config
 from ..training.trainer import Progress, Report
-from .cloud import CloudDistance, Surroundings
-from .many import FitJob, FitOutcome, fit_job
+from .cloud import CloudDistance, Surroundings, file_facts
+from .many import FitJob, FitOutcome, read_kept, run_fits
 from .samples import DOMAIN
 
 PLAN_FILE = "tiles.json"  # in the run directory: the boxes and the settings of all tiles
 POINTS, RUNS = "points", "tiles"  # folders there: points of the tiles until all are fitted, and their runs
 AROUND_FILE, AROUND = "around.npy", 30_000  # means of the whole cloud, beside the points of the tiles, and how many
-VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -82,12 +80,11 @@ class TilesJob:
             drop_noise=False,
             time_budget=None if budget is None else budget * at_a_time / self.plan.num_tiles,
         )
-        points, around = self.directory / POINTS, self.directory / POINTS / AROUND_FILE
-        parts = []
-        for number, (low, high) in enumerate(self.plan.boxes(margin=2 * self.plan.blend)):
+        points, runs, parts = self.directory / POINTS, self.directory / RUNS, []
+        for number in range(self.plan.num_tiles):
             name = tile_name(number)
-            beside = Surroundings(around, tuple(low), tuple(high)) if self.oriented else None
-            parts.append(FitJob(points / name, self.directory / RUNS / Path(name).stem, config, True, beside))
+            around = Surroundings(points / AROUND_FILE, self.plan, number) if self.oriented else None
+            parts.append(FitJob(points / name, runs / Path(name).stem, config, True, around))
         return parts
 
 
@@ -124,11 +121,11 @@ def plan_fit(
         shutil.rmtree(folder, ignore_errors=True)
     out.mkdir(parents=True, exist_ok=True)
     (out / FIELD_FILE).unlink(missing_ok=True)  # of an older run
-    about = {"version": VERSION, **_facts(path), "config": dataclasses.asdict(job.config)}
+    about = {**file_facts(path), "config": dataclasses.asdict(job.config)}
     write_json(out / PLAN_FILE, about | {"plan": dataclasses.asdict(job.plan)})
     partial = points.with_name(f".{POINTS}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    write_tiles(stream, job.plan, frame, partial, report=lambda done, total: report(_progress(done, total)))
+    write_tiles(stream, job.plan, frame, partial, report=counted(report, "sorting points into tiles"))
     if job.oriented and job.plan.cuts:
         with reported(report, "what lies around tiles"):
             np.save(partial / AROUND_FILE, _dipoles(stream, job.similarity))
@@ -149,39 +146,18 @@ def _dipoles(stream: CloudStream, similarity: Similarity) -> NDArray[np.float64]
     return np.concatenate((points, normals * areas[:, None]), axis=1)
 
 
-def _progress(done: int, total: int) -> Progress:
-    return Progress("sorting points into tiles", done, total, done / max(total, 1), {})
-
-
-def _facts(path: Path) -> dict[str, Any]:
-    """What tells whether a file is still the same."""
-    facts = path.stat()
-    return {"cloud": str(path.absolute()), "bytes": facts.st_size, "changed": facts.st_mtime_ns}
-
-
 def _read_plan(cloud: Path, out: Path) -> TilesJob:
     path = out / PLAN_FILE
-    try:
-        about = json.loads(path.read_text(encoding="utf-8"))
-        if about["version"] != VERSION:
-            raise InputError(f"{path}: of another version of mplicits; begin again with --force")
-        plan = about["plan"]
-        plan |= {
-            "cuts": tuple(Cut(*cut) for cut in plan["cuts"]),
-            "low": tuple(plan["low"]),
-            "high": tuple(plan["high"]),
-        }
-        plan = TilePlan(**plan)
-        config = load_config(FitConfig, None, about["config"])
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file, so there is nothing to resume; leave out --resume") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: damaged ({error}); begin again with --force") from error
-    if {name: about.get(name) for name in ("cloud", "bytes", "changed")} != _facts(cloud):
+    about = read_kept(path)
+    if {name: about.get(name) for name in file_facts(cloud)} != file_facts(cloud):
         raise InputError(
             f"{cloud}: is not the cloud that {path} was made for, or has changed; begin again with --force"
         )
-    return TilesJob(cloud, out, plan, config)
+    with damage(path, "begin again with --force"):
+        plan = about["plan"]
+        low, high, cuts = tuple(plan["low"]), tuple(plan["high"]), tuple(Split(*cut) for cut in plan["cuts"])
+        plan = TilePlan(**(plan | {"low": low, "high": high, "cuts": cuts}))
+    return TilesJob(cloud, out, plan, load_config(FitConfig, None, about["config"]))
 
 
 def fit_tiles(
@@ -207,19 +183,12 @@ def fit_tiles(
     check_jobs(jobs)
     started = time.monotonic()
     parts = job.jobs(jobs)
-    if jobs > 1 or address is not None or progress is None:
-        outcomes = run_jobs(fit_job, parts, jobs=jobs, address=address, retries=2, report=report)
-    else:
-        outcomes = run_jobs(lambda part: fit_job(part, _named(progress, part)), parts, report=report)
+    outcomes = run_fits(parts, jobs=jobs, address=address, progress=progress, report=report)
     failed = [outcome for outcome in outcomes if outcome.error is not None]
     if failed:
         first = f"{failed[0].item.directory.name}: {failed[0].error}"
         raise InputError(f"{job.directory}: {len(failed)} of {len(parts)} tiles failed, tile {first}; see --resume")
     return join_tiles(job, [part.directory for part in parts], seconds=time.monotonic() - started)
-
-
-def _named(progress: Callable[[str, Progress], None], part: FitJob) -> Report:
-    return lambda step: progress(part.directory.name, step)
 
 
 def join_tiles(job: TilesJob, runs: list[Path], *, seconds: float) -> Run[TiledField]:
@@ -232,10 +201,8 @@ def join_tiles(job: TilesJob, runs: list[Path], *, seconds: float) -> Run[TiledF
     for row, head in zip(bands, heads, strict=True):
         row[: len(head.field.deltas)] = head.field.deltas.double().numpy() * head.similarity.scale / similarity.scale
     reach = plan.blend / similarity.scale
-    splits = [
-        Split(cut.axis, (cut.place - similarity.center[cut.axis]) / similarity.scale, reach, cut.below, cut.above)
-        for cut in plan.cuts
-    ]
+    places = [(cut.place - similarity.center[cut.axis]) / similarity.scale for cut in plan.cuts]
+    splits = [cut._replace(place=place, half=reach) for cut, place in zip(plan.cuts, places, strict=True)]
     names = tuple(f"{RUNS}/{run.name}/{FIELD_FILE}" for run in runs)
 
     def joined(signs: tuple[int, ...], gap: float) -> TiledField:

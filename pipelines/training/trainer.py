@@ -46,10 +46,10 @@ class StopFlag:
 def stop_on_signals() -> Iterator[StopFlag]:
     """Turn the first Ctrl-C or SIGTERM into a flag that is read between two steps; a second one acts at once.
 
-    Signals belong to the main thread. Elsewhere it is the flag of `shared_flag`, or one that is never raised.
+    Signals belong to the main thread. Elsewhere it is `SHARED_FLAG`, or one that is never raised.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield _shared.get() or StopFlag()
+        yield SHARED_FLAG.get() or StopFlag()
         return
     flag = StopFlag()
     signals = (signal.SIGINT, signal.SIGTERM)
@@ -69,17 +69,8 @@ def stop_on_signals() -> Iterator[StopFlag]:
             signal.signal(number, before[number])
 
 
-_shared: ContextVar[StopFlag | None] = ContextVar("shared", default=None)
-
-
-@contextmanager
-def shared_flag(flag: StopFlag) -> Iterator[None]:
-    """In a thread, inside this, `stop_on_signals` gives the flag of the main thread, which hears the signals."""
-    token = _shared.set(flag)
-    try:
-        yield
-    finally:
-        _shared.reset(token)
+# In a thread: the flag of the main thread, which hears the signals.
+SHARED_FLAG: ContextVar[StopFlag | None] = ContextVar("shared", default=None)
 
 
 def load_compiler() -> None:

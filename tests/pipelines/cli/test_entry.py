@@ -356,21 +356,6 @@ def test_doctor_knows_all_extras(monkeypatch, tmp_path):
     assert {"las", "poisson", "texture"} <= set(re.findall(r"mplicits\[(\w+)\]", report)) <= set(extras) - {"dev"}
 
 
-def test_doctor_tells_two_builds_of_torch_apart(monkeypatch, tmp_path):
-    """As torchvision does where torch came without CUDA and torchvision with it."""
-    package = tmp_path / "torchvision.py"
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(doctor, "_installed", {"torchvision": "0.28.0"}.get)
-    package.write_text("raise RuntimeError('operator torchvision::nms does not exist')")
-    found = finding_about("torchvision", tmp_path)
-    assert found.level == "warning"
-    assert f"does not work with torch {torch.__version__} (RuntimeError: operator torchvision::nms" in found.text
-    package.write_text("")
-    assert finding_about("torchvision", tmp_path).level == "ok"
-    monkeypatch.setattr(doctor, "_installed", lambda name: None)
-    assert "torchvision" not in {finding.topic for finding in doctor.examine(tmp_path)}
-
-
 def test_doctor_names_what_is_missing_and_what_clashes(monkeypatch, tmp_path):
     versions = {"torch": "2.1.0", "opencv-contrib-python-headless": "5.0.0", "opencv-python": "4.9"}
     monkeypatch.setattr(doctor, "_installed", versions.get)

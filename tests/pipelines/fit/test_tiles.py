@@ -140,6 +140,6 @@ def test_the_command_says_how_far_it_is(ball: Path, tmp_path: Path, capsys: pyte
     words += ["--batch", "64", "--samples", "2000", "--device", "cpu", "--tile-size", "90"]
     assert main(["fit", str(ball), "-o", str(tmp_path / "run"), *words]) == 0
     captured = capsys.readouterr()
-    assert "tile 0001: fitted; 2 of 8, about" in captured.err
+    assert "0001: fitted after" in captured.err
     assert "TiledField" in captured.out
     assert f"mplicits mesh {tmp_path / 'run'}" in captured.out
