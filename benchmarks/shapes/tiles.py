@@ -119,6 +119,7 @@ class TilesBench(Benchmark[TilesRow]):
         shutil.rmtree(home, ignore_errors=True)
         home.mkdir(parents=True)
         plan: TilePlan | None = None
+        mesh: Mesh | None = None
         gap = sorting = None
         started = time.monotonic()
         if method == TILED:
@@ -126,7 +127,7 @@ class TilesBench(Benchmark[TilesRow]):
             started = time.monotonic()
             job_of = plan_fit(file, home / "run", self.config, report=context.progress)
             plan, sorting = job_of.plan, time.monotonic() - started
-            run = fit_tiles(job_of, jobs=self.workers)
+            run = fit_tiles(job_of, jobs=self.workers, report=lambda done: context.say(done.item.directory.name))
             field, similarity, gap = run.field, run.similarity, run.record["seams"]["typical"]
             file.unlink()
         elif method == SINGLE:
@@ -153,6 +154,7 @@ class TilesBench(Benchmark[TilesRow]):
                 blended = _blended(plan, truth + TOWN.origin)
                 kept = _away(truth, town)
                 inside, border = float(off[kept & ~blended].mean()), float(off[kept & blended].mean())
+        assert mesh is not None
         placed = mesh.moved(_back(similarity))
         found, _ = sample_points(placed, self.eval_samples, np.random.default_rng(3))
         floor = [*_both_ways(again, truth, town)]

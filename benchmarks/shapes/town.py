@@ -87,7 +87,7 @@ class Town:
         self.areas, self.normals = length / 2, across / length[:, None]
         self._boxes = np.array([[s.triangles.min(axis=(0, 1)), s.triangles.max(axis=(0, 1))] for s in self._solids])
 
-    def height(self, places: Float64) -> Float64:
+    def height(self, places: NDArray[np.floating]) -> NDArray[np.floating]:
         """Height of the ground ``(N,)`` at lattice points ``(N, 2)``."""
         x, y = places.T / self.size * 2 * math.pi
         return TOWN.hills * (np.sin(2 * x) * np.cos(3 * y) + np.cos(x + y))

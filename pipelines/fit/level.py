@@ -94,11 +94,8 @@ class JudgeOptions:
     voxel: float = 2.0  # edge of a voxel in spacings: about four points, a gap that neighbours can still fill
     surely: float = 2.0  # standard errors
     averaged: float = 0.07  # time constant of the mean of weights, in parts of the schedule
-    looks: int = 20  # judgements of a level during its training
-    halfway: int = 8  # after how many of them training ends if the level is useless
-    # Score over that without the level from which on it is. Most gains come late, as the rate falls: a level that was
-    # 1.1 times worse halfway ended at four fifths.
-    useless: float = 1.5
+    # Judgements of a level during its training. None of them ends it: most gains come late, as the rate falls.
+    looks: int = 20
 
 
 JUDGE = JudgeOptions()
@@ -348,7 +345,7 @@ class LevelObjective(Objective):
         self.shares = [None if area is None else area.cpu().double().cumsum(0) for area in areas]
         if judge is not None:  # `kept` is part of the checkpoints
             weights = siren.state_dict()
-            starts = {"looks": 0.0, "averaged": 0.0, "at": 1.0, "least": math.inf, "score": 0.0}
+            starts = {"looks": 0.0, "averaged": 0.0, "at": 1.0, "least": math.inf}
             self.kept = {name: torch.tensor(start, dtype=torch.float64) for name, start in starts.items()}
             self.kept |= {prefix + name: weights[name].clone() for prefix in (MEAN, BEST) for name in weights}
 
@@ -392,26 +389,17 @@ class LevelObjective(Objective):
         mean = copy.deepcopy(self.siren)
         mean.load_state_dict(without_prefix(MEAN, self.kept))
         score = self.judge.score(self.judge.errors(mean).mean())
-        self.kept["score"].fill_(score)
         if score < float(self.kept["least"]) or self.judge.noisy:
             self.kept["least"].fill_(score)
             self.kept["at"].fill_(done)
             for name, weights in without_prefix(MEAN, self.kept).items():
                 self.kept[BEST + name].copy_(weights)
 
-    @property
-    def settled(self) -> bool:
-        """See `Objective.settled`: held-out points say that the level is no use."""
-        if self.judge is None or self.judge.noisy or int(self.kept["looks"]) < JUDGE.halfway:
-            return False
-        return float(self.kept["score"]) >= JUDGE.useless * self.judge.score(self.judge.before)
-
     def take_best(self) -> Verdict | None:
         """Take the mean weights of the least score → the verdict; None, and the last weights, without a judge."""
         if self.judge is None:
             return None
-        if not self.settled:
-            self.look(1.0)
+        self.look(1.0)
         self.siren.load_state_dict(without_prefix(BEST, self.kept))
         return self.judge.verdict(self.judge.errors(self.siren), float(self.kept["at"]))
 

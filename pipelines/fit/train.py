@@ -308,7 +308,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
                 "sampling_seconds": round(sampling_seconds, 3),
                 "training_seconds": round(trainer.elapsed, 3),
                 "steps": trainer.step,
-                "ended_by_time_budget": trainer.ended_early and not objective.settled,
+                "ended_by_time_budget": trainer.ended_early,
                 "silenced": silenced,
                 "held_out": None if verdict is None else verdict.record(level, scale=self.similarity.scale),
                 "losses": trainer.losses,

@@ -186,8 +186,8 @@ def export_run(
         points = similarity.to_unit(cloud.points[np.isfinite(cloud.points).all(axis=1)])
     resolution = _resolution(field, options.resolution, support, level, say)
     with surface_needed(f"{file}: no surface to mesh"):
-        steep = {"lipschitz": field.slope_bound(STEEPNESS)} if isinstance(field, TiledField) else {}
-        mesh = extract_mesh(field, resolution=resolution, level=level, **steep)
+        slope = field.slope_bound(STEEPNESS) if isinstance(field, TiledField) else STEEPNESS
+        mesh = extract_mesh(field, resolution=resolution, level=level, lipschitz=slope)
     if "region" in metadata.get("run", {}):
         mesh = in_region(mesh)
         if mesh is None:

@@ -122,8 +122,8 @@ def _wire_sphere(*, meridians: int = 6, parallels: int = 5, sides: int = 64) -> 
 
 def _tubes(segments: Float64, radius: float, color: Rgb | Float64) -> Mesh:
     """Three-sided tubes along segments ``(S, 2, 3)``, closed at both ends."""
-    tubes = [trimesh.creation.cylinder(radius, segment=segment, sections=3) for segment in segments]
-    return _painted(trimesh.util.concatenate(tubes), color)
+    tubes = [_painted(trimesh.creation.cylinder(radius, segment=ends, sections=3), color) for ends in segments]
+    return _joined(tubes)
 
 
 def _octahedra(points: Float64, radius: float, color: Rgb) -> Mesh:

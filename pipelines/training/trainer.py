@@ -165,11 +165,6 @@ class Objective(ABC):
         self.network, self.groups, self.generator = network, groups, generator
         self.kept = dict(kept or {})
 
-    @property
-    def settled(self) -> bool:
-        """Whether the rest of the schedule is not worth its time."""
-        return False
-
     @abstractmethod
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """The terms of one fresh batch, unweighted and by name, and their weighted sum.
@@ -260,7 +255,7 @@ class Trainer(Generic[O]):
         device = self.trained[0].device
         if self.fraction < 1:
             report(self.progress)  # so that displays know when it began
-        while self.fraction < 1 and not self.objective.settled:
+        while self.fraction < 1:
             if flag.requested:
                 save()
                 return False

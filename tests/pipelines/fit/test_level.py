@@ -176,19 +176,16 @@ def test_a_stopped_level_continues_to_the_same_bits() -> None:
     assert any(not torch.equal(mine, theirs) for mine, theirs in zip(third.trained, whole.trained, strict=True))
 
 
-def test_training_ends_where_held_out_points_say_that_everything_gets_worse() -> None:
+def test_a_level_that_gets_worse_is_trained_to_its_end_and_not_kept() -> None:
+    """Most gains come late, so nothing that held-out points say on the way ends a training."""
     wrong = objective(judge_of(RADIUS - OFF), 0.0)
     torch.manual_seed(0)
     wrong.siren.load_state_dict(Siren(8, 2, omega=10.0).state_dict())  # far from the truth, in distance and in angle
     wrong.groups = [Group(list(wrong.siren.parameters()), lambda _: 0.0)]
     trainer = Trainer(wrong, stage="level 1", steps=80)
     assert trainer.run()
-    assert trainer.step <= 80 * (JUDGE.halfway + 1) / JUDGE.looks + 1
+    assert trainer.step == 80
     assert not wrong.take_best().better
-    resumed = Trainer(objective(judge_of(RADIUS - OFF), 0.0), stage="level 1", steps=80)
-    resumed.restore(trainer.state())
-    assert resumed.run()
-    assert resumed.step == trainer.step
 
 
 def test_what_chance_may_have_done_is_not_sure() -> None:
@@ -223,20 +220,6 @@ def test_a_level_gets_the_best_mean_of_its_weights() -> None:
     assert verdict.at == 0.5
     assert float(learner.siren.output.bias.detach()) == pytest.approx(means[2], rel=1e-5)
     assert verdict.after.distance == pytest.approx(OFF + means[2], rel=1e-3)
-
-
-def test_a_level_that_is_a_little_worse_halfway_goes_on() -> None:
-    """Most gains come late: of a score that is less than 1.5 times that without the level, nothing follows."""
-    for bias, settled in ((-2.1 * OFF, False), (-2.9 * OFF, True)):  # errors of 1.1 and of 1.9 OFF
-        learner = objective(judge_of(RADIUS - OFF), 0.0)
-        torch.nn.init.constant_(learner.siren.output.bias, bias)
-        learner.kept["averaged"].fill_(-100.0)  # so that the mean is the last
-        early = (JUDGE.halfway - 1) / JUDGE.looks
-        learner.look(early)
-        assert not learner.settled
-        learner.kept["averaged"].fill_(-100.0)
-        learner.look(JUDGE.halfway / JUDGE.looks)
-        assert learner.settled is settled
 
 
 @pytest.mark.parametrize("guessed", [True, False])
@@ -310,7 +293,6 @@ def test_noisy_points_judge_the_last_weights() -> None:
     for bias, done in ((-OFF, 0.3), (-0.5 * OFF, 0.6)):
         torch.nn.init.constant_(learner.siren.output.bias, bias)
         learner.look(done)
-        assert not learner.settled
     verdict = learner.take_best()
     assert (verdict.at, verdict.better) == (1.0, True)
     assert verdict.after.distance == pytest.approx(0.5 * OFF, rel=0.01)
