@@ -177,7 +177,7 @@ def a_siren(path: Path) -> None:
 
 
 STAND_INS: dict[str, Callable[[Path], None]] = {
-    **dict.fromkeys(("*scan.ply", "scans/*.ply", "ten_million.ply"), a_cloud),
+    **dict.fromkeys(("*scan.ply", "scans/*.ply", "ten_million.ply", "survey.ply"), a_cloud),
     "*.ply": a_mesh,
     "*.npz": arrays,
     "results/*": an_official_model,

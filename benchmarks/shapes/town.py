@@ -87,17 +87,17 @@ class Town:
         self.areas, self.normals = length / 2, across / length[:, None]
         self._boxes = np.array([[s.triangles.min(axis=(0, 1)), s.triangles.max(axis=(0, 1))] for s in self._solids])
 
-    def height(self, places: NDArray[np.floating]) -> NDArray[np.floating]:
+    def height(self, places: NDArray[np.floating]) -> Float64:
         """Height of the ground ``(N,)`` at lattice points ``(N, 2)``."""
         x, y = places.T / self.size * 2 * math.pi
-        return TOWN.hills * (np.sin(2 * x) * np.cos(3 * y) + np.cos(x + y))
+        return np.asarray(TOWN.hills * (np.sin(2 * x) * np.cos(3 * y) + np.cos(x + y)), np.float64)
 
     def _ground(self) -> Float64:
         cells = round(self.size / TOWN.ground)
         x, y = (axis.ravel() for axis in np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"))
         corners = [np.column_stack((x + a, y + b)) * TOWN.ground for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
         a, b, c, d = (np.column_stack((place, self.height(place))) for place in corners)
-        return np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)))
+        return np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)), dtype=np.float64)
 
     def _build(self, corner: Float64, random: np.random.Generator, *, wires: tuple[bool, bool]) -> None:
         """The house, the trees and the post of one plot, and the wires from there."""

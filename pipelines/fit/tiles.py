@@ -67,6 +67,11 @@ class TilesJob:
         return self.plan.normals and self.config.normals in ("auto", "file")
 
     @property
+    def aided(self) -> bool:
+        """Whether what lies around a tile decides with it where inside is."""
+        return self.oriented and bool(self.plan.cuts)
+
+    @property
     def similarity(self) -> Similarity:
         """From input coordinates to those of the joined field: the box of the points lies in the unit sphere."""
         return Similarity.to_unit_sphere(np.array([self.plan.low, self.plan.high]))
@@ -83,7 +88,7 @@ class TilesJob:
         points, runs, parts = self.directory / POINTS, self.directory / RUNS, []
         for number in range(self.plan.num_tiles):
             name = tile_name(number)
-            around = Surroundings(points / AROUND_FILE, self.plan, number) if self.oriented else None
+            around = Surroundings(points / AROUND_FILE, self.plan, number) if self.aided else None
             parts.append(FitJob(points / name, runs / Path(name).stem, config, True, around))
         return parts
 
@@ -126,7 +131,7 @@ def plan_fit(
     partial = points.with_name(f".{POINTS}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     write_tiles(stream, job.plan, frame, partial, report=counted(report, "sorting points into tiles"))
-    if job.oriented and job.plan.cuts:
+    if job.aided:
         with reported(report, "what lies around tiles"):
             np.save(partial / AROUND_FILE, _dipoles(stream, job.similarity))
     partial.rename(points)

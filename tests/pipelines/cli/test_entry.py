@@ -1,9 +1,7 @@
 """The command line as a user meets it: output, exit codes, and one line for each mistake."""
 
-import importlib.util
 import json
 import re
-import shlex
 import signal
 import subprocess
 import sys
@@ -13,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from evolutions import fails
 from mplicits.datasets import read_cloud, sample_sphere
@@ -321,20 +318,6 @@ def test_doctor_finds_nothing_wrong_here(capsys):
 def finding_about(topic, folder) -> doctor.Finding:
     (found,) = [finding for finding in doctor.examine(folder) if finding.topic == topic]
     return found
-
-
-def test_doctor_says_that_nothing_is_kept_of_what_python_compiles(monkeypatch, tmp_path):
-    monkeypatch.setattr(torch, "__file__", str(tmp_path / "it's" / "torch" / "__init__.py"))
-    kept = Path(importlib.util.cache_from_source(torch.__file__))
-    start = finding_about("start", tmp_path)
-    assert start.level == "warning"
-    kept.parent.mkdir(parents=True)
-    Path(torch.__file__).touch()
-    words = shlex.split(start.text.partition("; ")[2].partition(", and")[0])
-    assert words[0] == sys.executable  # another Python keeps other files
-    subprocess.run(words, check=True)
-    assert kept.exists()
-    assert finding_about("start", tmp_path).level == "ok"
 
 
 def test_doctor_says_who_evaluates(monkeypatch, tmp_path):

@@ -92,6 +92,7 @@ def test_an_interrupted_fit_goes_on_with_its_own_plan(ball: Path, tmp_path: Path
     quick = dataclasses.replace(SMALL, steps=(60, 2), samples=500)
     job = plan_fit(ball, out, quick, size=120.0)
     assert job.plan.num_tiles == 1
+    assert fit_tiles(job).field.num_tiles == 1
     job = plan_fit(ball, out, quick, size=90.0)
     with pytest.raises((KeyboardInterrupt, Interrupted)):
         fit_tiles(job, progress=stop)
