@@ -45,7 +45,7 @@ class TilesRow:
         tiles: how many.
         sort_seconds: for cutting the cloud and sorting its points.
         fit_seconds: for all fits.
-        memory: the largest of the process and of those that it started, in MiB.
+        memory: the largest of the process, or of one worker's, in MiB.
         accuracy: mean distance of the mesh to the town.
         completeness: the same the other way.
         floor: mean of both between two samplings of the town.
@@ -120,7 +120,7 @@ class TilesBench(Benchmark[TilesRow]):
         home.mkdir(parents=True)
         plan: TilePlan | None = None
         mesh: Mesh | None = None
-        gap = sorting = None
+        gap = sorting = memory = None
         started = time.monotonic()
         if method == TILED:
             file = _written(scan, home / "town.npy")
@@ -129,6 +129,7 @@ class TilesBench(Benchmark[TilesRow]):
             plan, sorting = job_of.plan, time.monotonic() - started
             run = fit_tiles(job_of, jobs=self.workers, report=lambda done: context.say(done.item.directory.name))
             field, similarity, gap = run.field, run.similarity, run.record["seams"]["typical"]
+            memory = run.record["peak_memory"]
             file.unlink()
         elif method == SINGLE:
             run = fit(scan.cloud(), self.config, out=home / "run", progress=context.progress)
@@ -140,7 +141,7 @@ class TilesBench(Benchmark[TilesRow]):
             field, similarity = None, prepared.similarity
             mesh = screened_poisson(prepared, depth=self.poisson_depth)
         seconds = time.monotonic() - started - (sorting or 0)
-        memory = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+        memory = memory or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         truth, _ = town.even(self.eval_samples, seed=1)
         again, _ = town.even(self.eval_samples, seed=2)
         inside = border = None
@@ -166,7 +167,7 @@ class TilesBench(Benchmark[TilesRow]):
                 tiles=1 if plan is None else plan.num_tiles,
                 sort_seconds=sorting or 0.0,
                 fit_seconds=seconds,
-                memory=memory / 1024,
+                memory=memory / 2**20,
                 accuracy=accuracy,
                 completeness=completeness,
                 floor=sum(floor) / 2,
