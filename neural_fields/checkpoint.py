@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save
@@ -103,9 +102,7 @@ class TileFiles:
     def __call__(self, number: int) -> Tile:
         """Read a tile; errors as of `load_field`."""
         field, own, _ = load_field(self.folder / self.names[number])
-        center = (np.asarray(own.center) - self.similarity.center) / self.similarity.scale
-        x, y, z = center.tolist()
-        return Tile(field, Similarity((x, y, z), own.scale / self.similarity.scale), self.signs[number])
+        return Tile(field, own.within(self.similarity), self.signs[number])
 
 
 def save_field(

@@ -304,10 +304,9 @@ def in_one_frame(shapes: Sequence[WorldField], *, margin: float = 0.0) -> tuple[
 def _placed(shape: WorldField, frame: Similarity) -> Field:
     if shape.similarity == frame:
         return shape.field
-    x, y, z = (float(c) for c in frame.to_unit(shape.similarity.center))
     field, learned = shape.field, next(shape.field.parameters(), None) is not None
     field = Bounded(field) if learned and not isinstance(field, Bounded) else field
-    return Placed(field, Similarity((x, y, z), shape.similarity.scale / frame.scale))
+    return Placed(field, shape.similarity.within(frame))
 
 
 def _unit(gradient: Tensor) -> Tensor:

@@ -49,6 +49,11 @@ class Similarity:
             raise ValueError("points: all of them coincide, so there is no scale")
         return cls((float(center[0]), float(center[1]), float(center[2])), radius)
 
+    def within(self, frame: Similarity) -> Similarity:
+        """The similarity to these coordinates from those of ``frame``, in place of from the input."""
+        x, y, z = (float(number) for number in frame.to_unit(self.center))
+        return Similarity((x, y, z), self.scale / frame.scale)
+
     def to_unit(self, points: ArrayLike) -> Float64:
         """Map ``(..., 3)`` input coordinates into the unit sphere, in float64."""
         return (np.asarray(points, np.float64) - np.asarray(self.center)) / self.scale

@@ -76,10 +76,10 @@ def borrowed_colors(run: str | Path, field: Field, similarity: Similarity) -> Co
     `shape_colors`.
     """
     geometry, own, _ = load_field(find_field(run), device=field.deltas.device)
-    center, scale = (np.asarray(own.center) - similarity.center) / similarity.scale, own.scale / similarity.scale
+    placed = own.within(similarity)
 
     def home(points: Tensor) -> Tensor:
-        return (points - points.new_tensor(center.tolist())) / scale
+        return (points - points.new_tensor(placed.center)) / placed.scale
 
     return shape_colors("--colors", run, geometry, field, 0.0, home)
 
