@@ -160,6 +160,11 @@ class Field(nn.Module, ABC):
         """
         return sum(isinstance(module, Field) for module in self.modules()) == 1
 
+    def slope_bound(self, slope: float) -> float:
+        """A bound on |∇f|, if that of every network or closed form inside is at most ``slope``."""
+        parts = (module for module in self.modules() if isinstance(module, Field) and module is not self)
+        return max((part.slope_bound(slope) for part in parts), default=slope)
+
     def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
         """Values ``(...,)`` of all levels up to ``level`` at ``x`` ``(..., d)``, coarse to fine.
 

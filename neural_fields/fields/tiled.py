@@ -1,7 +1,7 @@
 """Fields of neighbouring boxes as one, for what one network cannot represent.
 
-A binary tree of planes cuts space into boxes, and each has a field. Across a plane at c the weights of its two sides
-are σ and 1 − σ of (x − c) / h, with a cubic σ that rises from 0 at −1 to 1 at 1. The weight w_i of a box is the product
+A binary tree of planes cuts space into boxes, and each has a field. Across a plane at c its two sides have the weights
+σ and 1 − σ of (x − c) / h. The cubic σ rises from 0 at −1 to 1 at 1. The weight w_i of a box is the product
 along its path, so all weights add up to 1 everywhere, also where planes meet. Then
 
     f(x) = Σ_i w_i(x) clamp(f_i(x), −r, r).
@@ -61,7 +61,7 @@ class TiledField(Gated):
     Levels are those of the tiles, one with fewer staying at its finest. Each band is as wide as the widest of the tiles
     plus ``gap``. Values are distances up to ``reach``. Where a tile has no weight it is not evaluated.
 
-    With tiles of slope L that differ by at most ``gap`` where they overlap, the slope is at most `slope_bound` (L): the
+    With tiles of slope L that differ by at most ``gap`` where they overlap, the slope is at most `slope_bound` (L). The
     gradients of the weights add up to zero, so only differences of tiles count.
 
     Args:
@@ -124,8 +124,8 @@ class TiledField(Gated):
         """False: each tile is evaluated at the points where it has a weight."""
         return False
 
-    def slope_bound(self, slope: float = 1.0) -> float:
-        """A bound on |∇f| for tiles of this slope: ½ gap Σ|∇w_i| is added, and a plane adds 2 · ¾ / h to the sum."""
+    def slope_bound(self, slope: float) -> float:
+        """See `Field.slope_bound`: ½ gap Σ|∇w_i| is added, and a plane adds 2 · ¾ / h to the sum."""
         widest = max((SLOPE / split.half for split in self.splits), default=0.0)
         return slope + PLANES * widest * self.gap
 

@@ -65,7 +65,8 @@ def extract_mesh(
         resolution: cells along the longest axis of the box.
         level: the level whose zero set is wanted.
         bounds: lowest and highest corner of the box.
-        lipschitz: L, an upper bound on |∇f| near the surface and within a block of it; 1 for an exact distance.
+        lipschitz: L, an upper bound on |∇f| near the surface and within a block of it, 1 for an exact distance; of a
+            tiled field, that of its tiles.
         normals: whether normals are computed; their jets cost about twice the value at every vertex.
         clearance: least distance of a vertex from the ends of its edge, in cells, so that no two vertices coincide
             where f is exactly zero at a lattice point (which counts as outside).
@@ -87,6 +88,7 @@ def extract_mesh(
     if not 0 < clearance < 0.5:
         raise ValueError(f"clearance={clearance}: expected a fraction of a cell in (0, 0.5)")
     level = field.resolve_level(level)
+    lipschitz = field.slope_bound(lipschitz)
     sampler = Sampler(field, Lattice.over(bounds, resolution), batch, progress)
     times = [time.perf_counter()]
     blocks, centres, kept = cull_blocks(sampler, level=level, lipschitz=lipschitz)

@@ -19,7 +19,6 @@ from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import vertex_normals
 from ...neural_fields import Field, InputError, Mesh
 from ...neural_fields.backend.devices import upload
-from ...neural_fields.fields.tiled import TiledField
 from ...neural_fields.meshing.extract import extract_mesh, map_normals, surface_needed
 from ...neural_fields.tracing.sphere import map_attribute
 from ..surface.surface import Support, in_region, keep_largest, read_support, trim_distance, visible_part, without_blobs
@@ -32,7 +31,6 @@ from .printing import PrintReport, print_report
 
 # Cells per side that are tried, coarse to fine. The work grows with the square: the last is 16 times the first.
 RESOLUTIONS = (256, 512, 1024)
-STEEPNESS = 1.25  # of the tiles of a field: the default of `extract_mesh`
 # Less of the points than this is an edge or a tip, not a part.
 THIN_SHARE = 0.02
 
@@ -186,8 +184,7 @@ def export_run(
         points = similarity.to_unit(cloud.points[np.isfinite(cloud.points).all(axis=1)])
     resolution = _resolution(field, options.resolution, support, level, say)
     with surface_needed(f"{file}: no surface to mesh"):
-        slope = field.slope_bound(STEEPNESS) if isinstance(field, TiledField) else STEEPNESS
-        mesh = extract_mesh(field, resolution=resolution, level=level, lipschitz=slope)
+        mesh = extract_mesh(field, resolution=resolution, level=level)
     if "region" in metadata.get("run", {}):
         mesh = in_region(mesh)
         if mesh is None:

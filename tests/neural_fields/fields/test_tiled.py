@@ -72,8 +72,10 @@ def test_tiles_that_differ_keep_their_bound_of_the_slope() -> None:
     tiles = [Tile(nf.Plane(offset=sign * gap / 2), HERE) for sign in (1, 1, -1, 1, -1)]
     field = TiledField(tiles.__getitem__, SPLITS, reach=1.0, gap=gap).double()
     slopes = field.jet(cube(20_000)).gradient.norm(dim=1)
-    assert 2.1 < float(slopes.max()) < field.slope_bound()
-    assert field.slope_bound() == 1 + 3 * 0.75 / 0.05 * gap
+    assert 2.1 < float(slopes.max()) < field.slope_bound(1.0)
+    assert field.slope_bound(1.0) == 1 + 3 * 0.75 / 0.05 * gap
+    assert nf.Union(nf.Sphere(), nf.Offset(field, 0.1)).slope_bound(1.0) == field.slope_bound(1.0)
+    assert nf.Union(nf.Sphere(), nf.Plane()).slope_bound(1.25) == 1.25
 
 
 def test_beyond_its_domain_a_tile_goes_on_as_at_its_border() -> None:
@@ -86,7 +88,7 @@ def test_beyond_its_domain_a_tile_goes_on_as_at_its_border() -> None:
 def test_a_ball_is_traced_and_meshed_across_tiles() -> None:
     ball = nf.Sphere(radius=0.6)
     field = tiles_of(ball, reach=0.2).float()
-    mesh = nf.extract_mesh(field, resolution=48, lipschitz=field.slope_bound())
+    mesh = nf.extract_mesh(field, resolution=48, lipschitz=1.0)
     whole = nf.extract_mesh(ball, resolution=48)
     assert len(mesh.vertices) == len(whole.vertices)
     assert abs((mesh.vertices**2).sum(axis=1) ** 0.5 - 0.6).max() < 1e-5
