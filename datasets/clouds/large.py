@@ -84,9 +84,16 @@ class _Groups(NamedTuple):
 
 
 def merge_cloud(
-    stream: CloudStream, limit: int, *, isolation: float | None = 30.0, voxel: float | None = None
+    stream: CloudStream,
+    limit: int,
+    *,
+    isolation: float | None = 30.0,
+    voxel: float | None = None,
+    frame: Survey | None = None,
 ) -> tuple[PointCloud, Merging] | None:
-    """At most ``limit`` means of the points of a stream, which is read twice; None if all points coincide.
+    """At most ``limit`` means of the points of a stream, which is read twice, or once with its ``frame`` of `survey`.
+
+    None if all points coincide.
 
     Points with less than 1 / ``isolation`` of the median number of points in the 27 voxels around them are dropped:
     they would weigh as much as means of many. ``voxel`` is the first edge in input units; None for one by ``limit``.
@@ -94,7 +101,7 @@ def merge_cloud(
     if limit < 1:
         raise ValueError(f"limit={limit}: expected at least one")
     started = time.monotonic()
-    frame = survey(stream)
+    frame = frame or survey(stream)
     if not frame.extent > 0:
         return None
     groups, size = _grouped(stream, frame, voxel or _first_size(frame, limit), limit)

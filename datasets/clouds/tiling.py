@@ -77,7 +77,7 @@ def plan_tiles(stream: CloudStream, *, size: float | None = None, points: int | 
     They are no narrower than `TilingOptions.narrowest` allows, so that at most eight tiles meet.
 
     Raises:
-        InputError: the points have no extent, or there would be too few of them in a tile.
+        InputError: the points have no extent.
     """
     frame = survey(stream, TILING.sample)
     if not frame.extent > 0:

@@ -194,30 +194,26 @@ def _fit_tiles(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     from ..training.folder import check_new_run
     from ..training.jobs import check_jobs
 
-    jobs = arguments.jobs or 1
-    check_jobs(jobs)
+    jobs, address = arguments.jobs or 1, arguments.ray_address
+    check_jobs(jobs, address)
     check_new_run(arguments.out, resume=False, force=arguments.force or arguments.resume)
     how = ("--tiles", "auto") if arguments.tile_size is None else ("--tile-size", arguments.tile_size)
-    more = ("--jobs", jobs) * (jobs > 1) + ("--ray-address", arguments.ray_address) * (
-        arguments.ray_address is not None
-    )
+    more = ("--jobs", jobs) * (jobs > 1) + ("--ray-address", address) * (address is not None)
     again = command_line("fit", cloud, "-o", arguments.out, *how, *more, "--resume")
     with training(f"to continue: {again}", quiet=arguments.quiet, at_any_time=True) as show:
         report = show or (lambda _: None)
         job = plan_fit(cloud, arguments.out, config, size=arguments.tile_size, resume=arguments.resume, report=report)
-        alone = show is not None and jobs == 1 and arguments.ray_address is None
+        alone = show is not None and jobs == 1 and address is None
         run = fit_tiles(
             job,
             jobs=jobs,
-            address=arguments.ray_address,
+            address=address,
             progress=(lambda name, step: report(replace(step, stage=f"tile {name} {step.stage}"))) if alone else None,
             report=None if arguments.quiet else _Tally(job.plan.num_tiles),
         )
     print(describe(arguments.out))
-    if run.record["seams"]["opposed"]:
-        print(
-            f"warning: {run.record['seams']['opposed']} pairs of tiles oppose each other; look at them", file=sys.stderr
-        )
+    if opposed := run.record["seams"]["opposed"]:
+        print(f"warning: {opposed} pairs of tiles oppose each other; look at them", file=sys.stderr)
     print("next:", command_line("mesh", arguments.out, "-o", arguments.out / "mesh.ply", "--resolution", 1024))
     return 0
 

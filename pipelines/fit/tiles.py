@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,16 +17,16 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from ...datasets.clouds.large import merge_cloud
+from ...datasets.clouds.large import Survey, merge_cloud
 from ...datasets.clouds.readers.columns import CloudStream, MemoryStream
 from ...datasets.clouds.readers.reading import check_cloud_path, open_stream, read_cloud
 from ...datasets.clouds.tiling import TilePlan, plan_tiles, tile_name, write_tiles
-from ...neural_fields import InputError, Similarity, load_field
+from ...neural_fields import InputError, Similarity
 from ...neural_fields.backend.files import check_place, damage, write_json
 from ...neural_fields.checkpoint import TileFiles
 from ...neural_fields.fields.tiled import Split, TiledField
-from ..surface.surface import read_support
-from ..training.folder import FIELD_FILE, RunFolder, find_field, is_fitted, read_record
+from ..surface.surface import support_of_tiles
+from ..training.folder import FIELD_FILE, RunFolder, is_fitted, read_record
 from ..training.jobs import check_jobs
 from ..training.progress import counted, reported, silent
 from ..training.result import Run
@@ -45,7 +46,7 @@ AROUND_FILE, AROUND = "around.npy", 30_000  # means of the whole cloud, beside t
 class SeamOptions:
     """How tiles are compared where they overlap."""
 
-    points: int = 2_000  # of each tile
+    points: int = 2_000  # of each tile, on average
     share: float = 0.5  # of the reach: how far from the surface, at most
 
 
@@ -133,14 +134,14 @@ def plan_fit(
     write_tiles(stream, job.plan, frame, partial, report=counted(report, "sorting points into tiles"))
     if job.aided:
         with reported(report, "what lies around tiles"):
-            np.save(partial / AROUND_FILE, _dipoles(stream, job.similarity))
+            np.save(partial / AROUND_FILE, _dipoles(stream, frame, job.similarity))
     partial.rename(points)
     return job
 
 
-def _dipoles(stream: CloudStream, similarity: Similarity) -> NDArray[np.float64]:
+def _dipoles(stream: CloudStream, frame: Survey, similarity: Similarity) -> NDArray[np.float64]:
     """Means of the cloud with their normals times areas ``(N, 6)``, which tell each tile where inside is."""
-    merged = merge_cloud(stream, AROUND)
+    merged = merge_cloud(stream, AROUND, frame=frame)
     assert merged is not None
     cloud = merged[0]
     assert cloud.normals is not None
@@ -185,7 +186,7 @@ def fit_tiles(
     Raises:
         InputError: some tiles failed; the others are kept, and ``--resume`` goes on.
     """
-    check_jobs(jobs)
+    check_jobs(jobs, address)
     started = time.monotonic()
     parts = job.jobs(jobs)
     outcomes = run_fits(parts, jobs=jobs, address=address, progress=progress, report=report)
@@ -200,11 +201,9 @@ def join_tiles(job: TilesJob, runs: list[Path], *, seconds: float) -> Run[TiledF
     """Write the joined field of fitted tiles to the run directory."""
     plan, similarity = job.plan, job.similarity
     records = [read_record(run) for run in runs]
-    heads = [load_field(find_field(run)) for run in runs]
-    levels = max(head.field.num_levels for head in heads)
-    bands = np.zeros((len(heads), levels - 1))
-    for row, head in zip(bands, heads, strict=True):
-        row[: len(head.field.deltas)] = head.field.deltas.double().numpy() * head.similarity.scale / similarity.scale
+    scales = [record["similarity"]["scale"] / similarity.scale for record in records]
+    bands = [[scale * delta for delta in record["deltas"]] for record, scale in zip(records, scales, strict=True)]
+    widest = [max(each) for each in itertools.zip_longest(*bands, fillvalue=0.0)]
     reach = plan.blend / similarity.scale
     places = [(cut.place - similarity.center[cut.axis]) / similarity.scale for cut in plan.cuts]
     splits = [cut._replace(place=place, half=reach) for cut, place in zip(plan.cuts, places, strict=True)]
@@ -212,11 +211,12 @@ def join_tiles(job: TilesJob, runs: list[Path], *, seconds: float) -> Run[TiledF
 
     def joined(signs: tuple[int, ...], gap: float) -> TiledField:
         load = TileFiles(job.directory, names, similarity, signs)
-        return TiledField(load, splits, deltas=bands.max(axis=0).tolist(), reach=reach, gap=gap, domain=DOMAIN)
+        return TiledField(load, splits, deltas=widest, reach=reach, gap=gap, domain=DOMAIN)
 
-    asked = _asked(runs, records, similarity)
-    field = joined((1,) * len(runs), 0.0)
-    seams = compare_tiles(field, asked, turn=not job.oriented)
+    support = support_of_tiles(runs, similarity, 0)
+    assert support is not None
+    points = torch.from_numpy(support.points[:: 1 + len(support.points) // (SEAMS.points * len(runs))])
+    seams = compare_tiles(joined((1,) * len(runs), 0.0), points, turn=not job.oriented)
     field = joined(seams.signs, seams.gap)
     about = {
         "finished": True,
@@ -239,17 +239,6 @@ def join_tiles(job: TilesJob, runs: list[Path], *, seconds: float) -> Run[TiledF
         record = folder.finish(field, similarity, about)
     shutil.rmtree(job.directory / POINTS, ignore_errors=True)
     return Run(field, similarity, job.directory, record)
-
-
-def _asked(runs: list[Path], records: list[dict[str, Any]], similarity: Similarity) -> torch.Tensor:
-    """Points of the surface of all tiles ``(N, 3)``, in the coordinates of the joined field."""
-    parts: list[NDArray[np.float64]] = []
-    for run, record in zip(runs, records, strict=True):
-        support = read_support(run / FIELD_FILE, record, 0)
-        assert support is not None
-        own = Similarity(**record["similarity"])
-        parts.append(similarity.to_unit(own.to_input(support.points[:: 1 + len(support.points) // SEAMS.points])))
-    return torch.from_numpy(np.concatenate(parts))
 
 
 class Seams(NamedTuple):

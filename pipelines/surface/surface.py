@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -304,7 +304,8 @@ def read_support(field: Path, record: dict[str, Any], level: int) -> Support | N
     ``record`` is what ``run.json`` holds. Raises an InputError if the points are damaged or of another run.
     """
     if "tiles" in record:
-        return _support_of_tiles(field.parent, record, level)
+        runs = [field.parent / tile["run"] for tile in record["tiles"]]
+        return support_of_tiles(runs, Similarity(**record["similarity"]), level)
     path = field.with_name(SUPPORT_FILE)
     stages = record.get("stages", [])
     photographed = "region" in record
@@ -324,15 +325,14 @@ def read_support(field: Path, record: dict[str, Any], level: int) -> Support | N
     return Support(points, support_radius(points, error=error))
 
 
-def _support_of_tiles(run: Path, record: dict[str, Any], level: int) -> Support | None:
-    """The supports of all tiles of a run, in its own coordinates; None if one of them has none."""
-    home, found = Similarity(**record["similarity"]), list[Support]()
-    for tile in record["tiles"]:
-        own = read_record(run / tile["run"])
-        support = read_support(run / tile["run"] / FIELD_FILE, own, min(level, len(own["stages"]) - 1))
+def support_of_tiles(runs: Sequence[Path], home: Similarity, level: int) -> Support | None:
+    """The supports of the ``runs`` of tiles, in the coordinates of ``home``; None if one of them has none."""
+    found: list[Support] = []
+    for run in runs:
+        own = read_record(run)
+        support = read_support(run / FIELD_FILE, own, min(level, len(own["stages"]) - 1))
         if support is None:
             return None
-        placed = Similarity(**own["similarity"])
-        points = home.to_unit(placed.to_input(support.points))
-        found.append(Support(points, support.radius * placed.scale / home.scale))
+        placed = Similarity(**own["similarity"]).within(home)
+        found.append(Support(placed.to_input(support.points), support.radius * placed.scale))
     return Support(np.concatenate([part.points for part in found]), max(part.radius for part in found))

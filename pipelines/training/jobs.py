@@ -38,10 +38,12 @@ class Outcome(Generic[Item, Result]):
     seconds: float
 
 
-def check_jobs(jobs: int) -> None:
-    """Refuse less than one job, and more than one where there is no Ray, by an `InputError` before any work."""
+def check_jobs(jobs: int, address: str | None = None) -> None:
+    """Refuse less than one job, and what needs Ray where there is none, by an `InputError` before any work."""
     if jobs < 1:
         raise InputError(f"--jobs {jobs}: expected a whole number from 1")
+    if address is not None and importlib.util.find_spec("ray") is None:
+        raise InputError(f"--ray-address {address}: needs Ray; pip install mplicits[ray], or leave it out")
     if jobs > 1 and importlib.util.find_spec("ray") is None:
         raise InputError(f"--jobs {jobs}: needs Ray; pip install mplicits[ray], or leave --jobs out")
 
@@ -67,7 +69,7 @@ def run_jobs(
         KeyboardInterrupt: Ctrl-C. Fits under way have written their checkpoints, nothing else is begun.
         Interrupted: the same, where ``function`` is a fit in this process.
     """
-    check_jobs(jobs)
+    check_jobs(jobs, address)
     report = report or (lambda _: None)
     if address is None and (jobs == 1 or len(items) < 2):
         outcomes = []

@@ -14,6 +14,7 @@ from mplicits.pipelines.fit import tiles
 from mplicits.pipelines.fit.tiles import compare_tiles, fit_tiles, plan_fit
 from mplicits.pipelines.surface.surface import components, is_closed, read_surface
 from mplicits.pipelines.training.folder import find_field, load_still
+from mplicits.pipelines.training.jobs import check_jobs
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Interrupted, Progress
 from refusals import refused
@@ -134,6 +135,12 @@ def test_mistakes_cost_no_work(ball: Path, run: Path, tmp_path: Path, capsys: py
     (tmp_path / "damaged").mkdir()
     (tmp_path / "damaged" / tiles.PLAN_FILE).write_text(json.dumps(about | {"plan": {}}))
     assert "damaged" in told(ball, "-o", tmp_path / "damaged", "--tiles", "auto", "--resume")
+
+
+def test_a_cluster_needs_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with refused("--ray-address here", "pip install mplicits"):
+        check_jobs(1, "here")
 
 
 def test_the_command_says_how_far_it_is(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
