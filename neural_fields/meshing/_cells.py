@@ -18,17 +18,23 @@ from numpy.typing import NDArray
 
 from ..fields.field import Field
 
+Ints = NDArray[np.integer]
+Floats = NDArray[np.floating]
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Cubic cells of edge ``step`` from ``low`` upwards; ``shape`` counts cells, so there are ``shape + 1`` points."""
+    """Cubic cells of edge ``step`` from ``low`` upwards; ``shape`` counts cells, so there are ``shape + 1`` points.
+
+    A part of a lattice has the same ``low``, and begins at that lattice's point ``first``.
+    """
 
     low: tuple[float, float, float]
     step: float
     shape: tuple[int, int, int]
+    first: tuple[int, int, int] = (0, 0, 0)
 
     @classmethod
     def over(cls, bounds: Bounds, resolution: int) -> Lattice:
@@ -50,12 +56,18 @@ class Lattice:
 
     def positions(self, index: NDArray[np.integer] | NDArray[np.float64]) -> NDArray[np.float64]:
         """Coordinates of points ``(N, 3)`` counted in cells, whole or not."""
-        return np.asarray(index, np.float64) * self.step + np.asarray(self.low)
+        return (np.asarray(index, np.float64) + self.first) * self.step + np.asarray(self.low)
+
+    def part(self, first: Ints, cells: int) -> Lattice:
+        """The part of at most ``cells`` cells along each axis that begins at the point ``first``."""
+        x, y, z = (min(cells, end - start) for start, end in zip(first.tolist(), self.shape, strict=True))
+        i, j, k = first.tolist()
+        return Lattice(self.low, self.step, (x, y, z), (i, j, k))
 
     def __str__(self) -> str:
         """The box, for messages."""
-        high = self.positions(np.asarray(self.shape))
-        return " × ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(self.low, high, strict=True))
+        low, high = self.positions(np.array([(0, 0, 0), self.shape]))
+        return " × ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True))
 
 
 class Sampler:
@@ -212,9 +224,6 @@ def cube_tables() -> CubeTables:
     return CubeTables(crossed, ends, start, triangles)
 
 
-Ints = NDArray[np.integer]
-Floats = NDArray[np.floating]
-
 _BITS = np.array([1, 2, 4])
 _OFFSETS: Ints = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
 
@@ -231,10 +240,21 @@ class ActiveCells:
     corners: NDArray[np.int32]  # (8, C) rows of `points`
     points: Ints  # (P, 3) lattice points
     values: Floats  # (P,) their values, valid at the ends of crossed edges
+    on_sides: tuple[Ints, Floats]  # points (S, 3) on the sides of the box that were evaluated, and their values (S,)
 
 
-def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints, Floats, NDArray[np.bool_]]:
-    """Halve blocks from about 1/32 of the box down to 2³ cells, dropping those that cannot hold a zero.
+class Given(NamedTuple):
+    """Known before: values ``(N,)`` at lattice points ``(N, 3)``; origins ``(B, 3)`` of blocks that are crossed."""
+
+    points: Ints
+    values: Floats
+    crossed: Ints
+
+
+def cull_blocks(
+    sampler: Sampler, *, level: int, lipschitz: float, along: int = 32, smallest: int = 2
+) -> tuple[Ints, Floats, NDArray[np.bool_]]:
+    """Halve blocks, at first about ``along`` an axis, down to 2³ cells, dropping those that cannot hold a zero.
 
     A stage with blocks of half diagonal r evaluates level j at the block centres c and keeps those with
 
@@ -245,11 +265,12 @@ def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints
     since there the bound is violated.
 
     Returns, of all blocks of 2³ cells evaluated: origins ``(B, 3)``, target values at the centres ``(B,)``, and which
-    survived ``(B,)``; the others still bound the field. Raises NoSurfaceError if none survives.
+    survived ``(B,)``; the others still bound the field. With ``smallest``, a power of two, the same of larger blocks.
+    Raises NoSurfaceError if none survives.
     """
     lattice = sampler.lattice
     deltas = [float(delta) for delta in sampler.field.deltas[:level]]
-    size = 2 ** max(1, math.floor(math.log2(max(lattice.shape) / 32)))
+    size = max(smallest, 2 ** max(1, math.floor(math.log2(max(lattice.shape) / along))))
     axes = [np.arange(0, cells, size) for cells in lattice.shape]
     blocks = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     while True:
@@ -261,7 +282,7 @@ def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints
         kept = (np.abs(values) <= reach + slack) | _beside_other_sign(blocks // size, values < 0)
         if not kept.any():
             raise NoSurfaceError(_where_signs_are(values, blocks + size // 2, lattice, sampler))
-        if size == 2:
+        if size == smallest:
             return blocks, values, kept
         size //= 2
         blocks = (blocks[kept, None] + CORNERS * size).reshape(-1, 3)
@@ -296,28 +317,41 @@ def _where_signs_are(values: Floats, points: Ints, lattice: Lattice, sampler: Sa
 
 
 def active_cells(
-    sampler: Sampler, blocks: Ints, centres: Floats, kept: NDArray[np.bool_], *, level: int, lipschitz: float
+    sampler: Sampler,
+    blocks: Ints,
+    centres: Floats,
+    kept: NDArray[np.bool_],
+    *,
+    level: int,
+    lipschitz: float,
+    given: Given | None = None,
 ) -> ActiveCells:
     """The crossed cells of 2³-cell blocks, with exact values at both ends of every crossed edge.
 
     The sign at a corner q follows from any known centre c of a block around it with |f(c)| > L |q − c|; only other
     corners are evaluated, then the ends of crossed edges, until nothing is new. Where the surface leaves the blocks
     through a face, the neighbour there is added: the surface is closed inside the box also where the field is steeper
-    than L.
+    than L. What is ``given`` is taken, and then the values at the sides of the box are returned with the cells.
 
     Raises NoSurfaceError if the blocks hold no sign change.
     """
-    known: tuple[Ints, Floats] = (np.empty(0, np.int64), centres[:0])
+    known, missing = (np.empty((0, 3), np.int64), centres[:0]), blocks[:0]
+    if given is not None:
+        known = (given.points, given.values)
+        whole = tuple(cells + 1 for cells in sampler.lattice.shape)
+        there, wanted = (np.ravel_multi_index(tuple(each.T), whole) for each in (blocks[kept], given.crossed))
+        missing = given.crossed[~np.isin(wanted, there)]
     while True:
+        if len(missing):
+            blocks = np.concatenate((blocks, missing))
+            added = sampler.values(len(missing), lambda part: missing[part] + 1, level=level, stage="closing")  # noqa: B023
+            centres = np.concatenate((centres, added))
+            kept = np.concatenate((kept, np.ones(len(missing), bool)))
         corners = _Corners(sampler, blocks, centres, kept, known, level=level, lipschitz=lipschitz)
         missing = corners.open_neighbours()
         if not len(missing):
-            return corners.cells()
+            return corners.cells(sides=given is not None)
         known = corners.known_values()
-        blocks = np.concatenate((blocks, missing))
-        added = sampler.values(len(missing), lambda part: missing[part] + 1, level=level, stage="closing")  # noqa: B023
-        centres = np.concatenate((centres, added))
-        kept = np.concatenate((kept, np.ones(len(missing), bool)))
 
 
 def _merged(first: Ints, second: Ints) -> Ints:
@@ -364,8 +398,11 @@ class _Corners:
         self.value = np.zeros(count, centres.dtype)
         self.known = np.zeros(count, bool)
         self._set(self.rows(_OFFSETS[13]), centres[order])
-        owner = np.searchsorted(self.owners, known[0] // 8)
-        self._set(owner * 8 + known[0] % 8, known[1])
+        points, values = known
+        keys = (points // 2 + 1) @ self.strides
+        owner = np.minimum(np.searchsorted(self.owners, keys), len(self.owners) - 1).astype(np.int32)
+        listed = self.owners[owner] == keys
+        self._set(self._row(owner, points)[listed], values[listed])
         self.inside = np.zeros(count, bool)
         self._find_signs(all_keys, centres, lipschitz * self.lattice.step)
         self._verify_ends()
@@ -376,7 +413,7 @@ class _Corners:
 
     @staticmethod
     def _row(owner: NDArray[np.int32], offset: Ints) -> NDArray[np.int32]:
-        return owner * 8 + np.int32(offset % 2 @ _BITS)
+        return owner * 8 + (offset % 2 @ _BITS).astype(np.int32)
 
     def points(self, rows: NDArray[np.integer]) -> Ints:
         """Lattice points ``(N, 3)`` of point numbers."""
@@ -462,12 +499,12 @@ class _Corners:
         return self._places(np.unique(np.concatenate(found)), (0, 0, 0))
 
     def known_values(self) -> tuple[Ints, Floats]:
-        """Keys of all points evaluated, and their values."""
+        """All lattice points evaluated ``(N, 3)``, and their values ``(N,)``."""
         rows = np.flatnonzero(self.known)
-        return self.owners[rows // 8] * 8 + rows % 8, self.value[rows]
+        return self.points(rows), self.value[rows]
 
-    def cells(self) -> ActiveCells:
-        """The crossed cells."""
+    def cells(self, *, sides: bool) -> ActiveCells:
+        """The crossed cells; with ``sides``, all points evaluated on the sides of the box too."""
         cases = self._cases()
         crossed = [np.flatnonzero((case != 0) & (case != 255)) for case in cases]
         chosen = np.concatenate([case[rows] for case, rows in zip(cases, crossed, strict=True)])
@@ -487,4 +524,9 @@ class _Corners:
         number[used] = np.arange(len(used), dtype=np.int32)
         for column in corners:
             column[:] = number[column]
-        return ActiveCells(chosen, corners, self.points(used), self.value[used])
+        on_sides = (used[:0].reshape(-1, 3), self.value[:0])
+        if sides:
+            points, values = self.known_values()
+            kept = ((points == 0) | (points == self.lattice.shape)).any(axis=1)
+            on_sides = (points[kept], values[kept])
+        return ActiveCells(chosen, corners, self.points(used), self.value[used], on_sides)

@@ -19,6 +19,8 @@ from ._cells import (
     EDGE_ENDS,
     ActiveCells,
     Bounds,
+    Given,
+    Ints,
     Lattice,
     Progress,
     Sampler,
@@ -90,10 +92,29 @@ def extract_mesh(
     level = field.resolve_level(level)
     lipschitz = field.slope_bound(lipschitz)
     sampler = Sampler(field, Lattice.over(bounds, resolution), batch, progress)
+    return extract_surface(sampler, level, lipschitz, normals=normals, clearance=clearance)[0]
+
+
+def extract_surface(
+    sampler: Sampler,
+    level: int,
+    lipschitz: float,
+    *,
+    normals: bool,
+    clearance: float,
+    given: Given | None = None,
+) -> tuple[Mesh, ActiveCells, Ints]:
+    """The mesh in the box of a sampler, its cells, and for each vertex the rows ``(V, 2)`` of the ends of its edge."""
     times = [time.perf_counter()]
-    blocks, centres, kept = cull_blocks(sampler, level=level, lipschitz=lipschitz)
+    try:
+        along = 32 if given is None else 8
+        blocks, centres, kept = cull_blocks(sampler, level=level, lipschitz=lipschitz, along=along)
+    except NoSurfaceError:
+        if given is None or not len(given.crossed):
+            raise
+        blocks, centres, kept = given.crossed[:0], given.values[:0], np.empty(0, bool)
     times.append(time.perf_counter())
-    cells = active_cells(sampler, blocks, centres, kept, level=level, lipschitz=lipschitz)
+    cells = active_cells(sampler, blocks, centres, kept, level=level, lipschitz=lipschitz, given=given)
     times.append(time.perf_counter())
     faces, ends = _triangles(cells)
     fractions = _crossing(cells.values[ends[:, 0]], cells.values[ends[:, 1]]).clip(clearance, 1 - clearance)
@@ -118,7 +139,7 @@ def extract_mesh(
     stages = ("cull", "corners", "triangles", "normals")
     seconds = {stage: after - before for stage, before, after in zip(stages, times, times[1:], strict=False)}
     stats = MeshStats(tuple(sampler.counts), int(kept.sum()), len(cells.cases), seconds)
-    return Mesh(vertices, faces, unit, stats=stats)
+    return Mesh(vertices, faces, unit, stats=stats), cells, ends
 
 
 def surface_of(field: FieldLike, *, resolution: int, level: int = -1) -> Mesh | None:

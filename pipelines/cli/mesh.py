@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from ...neural_fields.backend.errors import InputError
 from ..training.settings import given_flags
 from .common import Command, add_flags, positive, whole, write_json
 
@@ -22,7 +23,11 @@ UNITS = ("um", "mm", "cm", "m", "km", "in", "ft")
 def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_flags(parser, "run", "--time", "--level")
-    add_flags(parser, "--out", help=", ".join(MESH_FILES))
+    add_flags(parser, "--out", help=f"{', '.join(MESH_FILES)}; with --format 3dtiles a folder")
+    what = "3dtiles: 3D Tiles 1.1, a folder of tiles at several steps of detail, for web viewers such as Cesium"
+    add("--format", choices=("3dtiles",), help=what)
+    what = "coordinate system of the input, for 3D Tiles: EPSG:NUMBER or WKT (default: that of a LAS or LAZ file)"
+    add("--crs", metavar="NAME", help=what)
     add_flags(parser, "--resolution", help="cells per side (256, up to 1024 where parts are thin)")
     add_flags(parser, "--normal-level", help="normals of this level on the mesh (default: of its own)")
     what = "leave out the colours of the run's texture"
@@ -53,6 +58,10 @@ def _mesh(arguments: argparse.Namespace) -> int:
     from ..mesh.printing import format_report
 
     started = time.monotonic()
+    if arguments.format is not None:
+        return _scene(arguments, started)
+    if arguments.crs is not None:
+        raise InputError("--crs: goes with --format 3dtiles")
     options = MeshOptions(**given_flags(arguments, MeshOptions))
     if arguments.json and options.report is None and options.texture is None:
         options = dataclasses.replace(options, report=True)
@@ -66,6 +75,26 @@ def _mesh(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _scene(arguments: argparse.Namespace, started: float) -> int:
+    from ..mesh.extract import MeshOptions
+    from ..mesh.scene import SceneOptions, scene_of_run
+    from ..training.progress import progress_bars
+
+    given = given_flags(arguments, SceneOptions)
+    plain = MeshOptions()
+    for name, value in given_flags(arguments, MeshOptions).items():
+        if name not in given and value != getattr(plain, name):
+            raise InputError(f"--{name.replace('_', '-')}: does not go with --format 3dtiles; leave it out")
+    with progress_bars(counting=True) as report:
+        scene = scene_of_run(arguments.run, arguments.out, SceneOptions(**given), say=print, report=report)
+    print(
+        f"{arguments.out}/tileset.json: {scene.tiles:,} tiles in {scene.steps} steps of detail, the coarsest within "
+        f"{scene.error:.3g} m, the finest of {scene.faces:,} faces, in {time.monotonic() - started:.1f} s"
+    )
+    write_json(arguments.json, scene._asdict())
+    return 0
+
+
 MESH = Command(
     "extract a mesh from a fit",
     """  mplicits mesh runs/scan -o scan_mesh.ply --resolution 512
@@ -73,7 +102,8 @@ MESH = Command(
   mplicits mesh runs/scan -o scan.glb --keep-largest --trim-distance 0.01
   mplicits mesh runs/scan -o scan.glb --up z --unit mm --center
   mplicits mesh runs/scan -o small.ply --faces 20000
-  mplicits mesh runs/scan -o scan.stl --up z --unit mm --json print.json""",
+  mplicits mesh runs/scan -o scan.stl --up z --unit mm --json print.json
+  mplicits mesh runs/city -o city --format 3dtiles --resolution 2048""",
     _mesh_arguments,
     _mesh,
     "Extract a mesh from a fit, in the coordinates of its input; or upright, in metres and at the origin.",

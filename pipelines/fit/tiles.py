@@ -26,7 +26,7 @@ from ...neural_fields.backend.files import check_place, damage, write_json
 from ...neural_fields.checkpoint import TileFiles
 from ...neural_fields.fields.tiled import Split, TiledField
 from ..surface.surface import support_of_tiles
-from ..training.folder import FIELD_FILE, RunFolder, is_fitted, read_record
+from ..training.folder import FIELD_FILE, RunFolder, is_fitted, named_cloud, read_record
 from ..training.jobs import check_jobs
 from ..training.progress import counted, reported, silent
 from ..training.result import Run
@@ -220,7 +220,7 @@ def join_tiles(job: TilesJob, runs: list[Path], *, seconds: float) -> Run[TiledF
     field = joined(seams.signs, seams.gap)
     about = {
         "finished": True,
-        "cloud": str(job.cloud.absolute()),
+        **named_cloud(str(job.cloud), job.directory),
         "similarity": dataclasses.asdict(similarity),
         "config": dataclasses.asdict(job.config),
         "tiles": [

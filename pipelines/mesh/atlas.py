@@ -181,10 +181,10 @@ def decimated(mesh: Mesh, faces: int, *, unit: float = 1.0) -> Decimated:
     return Decimated(Mesh(vertices, corners.astype(np.int32)), cost)
 
 
-def deviation(full: Mesh, left: Mesh) -> tuple[float, float]:
+def deviation(full: Mesh, left: Mesh, *, probes: int = 50_000) -> tuple[float, float]:
     """Largest and mean distance between two meshes, both ways; where it is measured says `Decimation`."""
-    there = np.abs(MeshDistance(left).signed(_thinned(full.used_vertices())))
-    back = np.abs(MeshDistance(full).signed(_thinned(_probes(left))))
+    there = np.abs(MeshDistance(left).signed(_thinned(full.used_vertices(), probes)))
+    back = np.abs(MeshDistance(full).signed(_thinned(_probes(left), probes)))
     return float(max(there.max(), back.max())), float(there.mean() + back.mean()) / 2
 
 
@@ -196,6 +196,6 @@ def _probes(surface: Mesh) -> Float64:
     return np.concatenate((surface.used_vertices(), surface.vertices[edges].mean(axis=1), corners.mean(axis=1)))
 
 
-def _thinned(points: Float64) -> Float64:
+def _thinned(points: Float64, count: int) -> Float64:
     # More points would take seconds and change little.
-    return points[:: -(-len(points) // 50_000)]
+    return points[:: -(-len(points) // count)]

@@ -182,7 +182,7 @@ def export_run(
         source = options.cloud or fitted_cloud(file, metadata, remedy="name it with --cloud FILE")
         cloud = read_cloud(source, columns=columns)
         points = similarity.to_unit(cloud.points[np.isfinite(cloud.points).all(axis=1)])
-    resolution = _resolution(field, options.resolution, support, level, say)
+    resolution = chosen_resolution(field, options.resolution, support, level, say)
     with surface_needed(f"{file}: no surface to mesh"):
         mesh = extract_mesh(field, resolution=resolution, level=level)
     if "region" in metadata.get("run", {}):
@@ -226,7 +226,7 @@ def export_run(
     return Exported(mesh, decimation, printing)
 
 
-def _resolution(
+def chosen_resolution(
     field: Field, asked: int | None, support: Support | None, level: int, say: Callable[[str], None] | None
 ) -> int:
     """Cells per side; ``say`` is called with a warning if parts are too thin for them."""

@@ -110,15 +110,15 @@ def sample_points(surface: Mesh, count: int, rng: np.random.Generator) -> tuple[
 
 def components(surface: Mesh) -> int:
     """Connected components of the faces, through shared vertices, equal vertices merged."""
-    return len(np.unique(component_of_faces(surface.merged)))
+    return int(component_of_faces(surface.merged).max(initial=-1)) + 1
 
 
-def component_of_faces(mesh: Mesh) -> NDArray[np.int32]:
-    """The number ``(F,)`` of the connected component of each face, through vertices that faces share."""
+def component_of_faces(mesh: Mesh) -> NDArray[np.intp]:
+    """The number ``(F,)`` from 0 up of the connected component of each face, through vertices that faces share."""
     a, b = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
     size = len(mesh.vertices)
     graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(size, size)).tocsr()
-    return connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+    return np.unique(connected_components(graph, directed=False)[1][mesh.faces[:, 0]], return_inverse=True)[1]
 
 
 def is_closed(surface: Mesh) -> bool:
@@ -191,26 +191,46 @@ def drop_unsupported(
     reach = support_radius(points) if radius is None else radius
     if not reach > 0:
         raise ValueError(f"radius={reach}: expected > 0")
-    component = component_of_faces(mesh)
-    number = np.unique(component, return_inverse=True)[1]
-    nearest = KDTree(points).query(mesh.vertices, distance_upper_bound=reach, workers=-1)[0]
-    share = np.isfinite(nearest)[mesh.faces].mean(axis=1)
-    areas = face_normals(mesh)[1]
-    whole = np.bincount(number, weights=areas)
-    kept = np.bincount(number, weights=areas * share) >= least * whole
-    kept &= np.bincount(number, weights=share) > 0  # nothing of no area either
-    if kept.sum() > 1:
-        of_vertex = np.zeros(len(mesh.vertices), np.int64)
-        of_vertex[mesh.faces] = number[:, None]
-        used = np.unique(mesh.faces)
-        near, whose = KDTree(mesh.vertices[used]).query(points, distance_upper_bound=reach, workers=-1)
-        own = np.bincount(of_vertex[used[np.asarray(whose)[np.isfinite(near)]]], minlength=len(whole))
-        expected = whole / max(spacing_of(np.asarray(points, np.float64)), 1e-300) ** 2
-        # Around one or two strays a fit may close a bubble as small as their spacing.
-        kept &= own >= np.minimum(3, expected / 2)
+    number = component_of_faces(mesh)
+    found = footing(mesh, number, KDTree(points), reach)
+    kept = found.stands(spacing_of(np.asarray(points, np.float64)), least=least)
     if kept.all() or not kept.any():
         return Supported(mesh, 0, 0.0)
-    return Supported(keep_faces(mesh, kept[number]), int((~kept).sum()), float(whole[~kept].sum() / whole.sum()))
+    return Supported(
+        keep_faces(mesh, kept[number]), int((~kept).sum()), float(found.area[~kept].sum() / found.area.sum())
+    )
+
+
+class Footing(NamedTuple):
+    """Of each component ``(C,)``: its area, how much of it is near points, and how many points are nearest to it."""
+
+    area: Float64
+    near: Float64
+    points: Float64
+
+    def stands(self, spacing: float, *, least: float = 0.05) -> NDArray[np.bool_]:
+        """Which components rest on points with this spacing, see `drop_unsupported`."""
+        kept = (self.near >= least * self.area) & (self.near > 0)
+        if kept.sum() > 1:
+            # Around one or two strays a fit may close a bubble as small as their spacing.
+            kept &= self.points >= np.minimum(3, self.area / max(spacing, 1e-300) ** 2 / 2)
+        return kept
+
+
+def footing(mesh: Mesh, number: NDArray[np.integer], tree: KDTree, reach: float) -> Footing:
+    """The `Footing` of a mesh, whose faces have the ``number`` ``(F,)`` of their component, on the points of a tree."""
+    count = int(number.max()) + 1
+    share = np.isfinite(tree.query(mesh.vertices, distance_upper_bound=reach, workers=-1)[0])[mesh.faces].mean(axis=1)
+    areas = face_normals(mesh)[1]
+    of_vertex = np.zeros(len(mesh.vertices), np.int64)
+    of_vertex[mesh.faces] = number[:, None]
+    used = np.unique(mesh.faces)
+    corners = mesh.vertices[used]
+    around = ((tree.data >= corners.min(axis=0) - reach) & (tree.data <= corners.max(axis=0) + reach)).all(axis=1)
+    near, whose = KDTree(corners).query(tree.data[around], distance_upper_bound=reach, workers=-1)
+    own = of_vertex[used[np.asarray(whose)[np.isfinite(near)]]]
+    weights = (areas, areas * share)
+    return Footing(*(np.bincount(number, each, count) for each in weights), np.bincount(own, minlength=count) * 1.0)
 
 
 def without_blobs(

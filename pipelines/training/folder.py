@@ -25,6 +25,7 @@ from safetensors.numpy import save as save_arrays
 from safetensors.torch import save
 from torch import Tensor
 
+from ...datasets.clouds.readers.las import coordinate_system
 from ...neural_fields import Field, InputError, Similarity, load_field
 from ...neural_fields.backend import files as disk
 from ...neural_fields.backend.files import check_place, damage, json_bytes, write_whole
@@ -300,12 +301,14 @@ def named_cloud(source: str, run: Path | None) -> dict[str, str]:
     """Where the cloud of a run directory is, for a record, so that `fitted_cloud` finds it from any folder.
 
     ``cloud`` is the absolute path; a source that is no file stays unchanged. ``cloud_from_run`` is the path from the
-    run's directory, which holds when both are moved together.
+    run's directory, which holds when both are moved together. ``crs`` is its coordinate reference system, if any.
     """
     file = Path(source)
     if not file.is_file() and (run is None or file != run / CLOUD_FILE):  # that one comes with the first checkpoint
         return {"cloud": source}
     named = {"cloud": str(file.absolute())}
+    if file.is_file() and (crs := coordinate_system(file)) is not None:
+        named["crs"] = crs
     if run is not None:
         with suppress(ValueError):  # Windows: they are on two drives
             named["cloud_from_run"] = os.path.relpath(file.resolve(), run.resolve())

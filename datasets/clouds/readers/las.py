@@ -22,6 +22,9 @@ _VERSION = struct.Struct("<BB"), 24
 _SIZES = struct.Struct("<HIIBHI"), 94
 _SCALES = struct.Struct("<3d"), 131
 _SIZES_14 = struct.Struct("<QIQ"), 235
+SUFFIXES = (".las", ".laz")
+GEO_KEYS = (3072, 2048)  # of GeoTIFF: the projected, and the geographic coordinate system
+USER_DEFINED = 32767  # which is no number of EPSG
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of LASzip's items by their kind; extra bytes (14) have one for each byte
 
 
@@ -83,6 +86,19 @@ def read_las(path: Path, columns: str | None = None, *, drop_noise: bool = False
     normals = None if normals is None else normals.astype(np.float32)
     colors = None if colors is None else colors_from(colors)
     return PointCloud(points, normals, colors, str(path), reading=stream.reading)
+
+
+def coordinate_system(path: Path) -> str | None:
+    """The coordinate reference system of a LAS or LAZ file, as WKT or as EPSG:NUMBER; None if it names none."""
+    if path.suffix.lower() not in SUFFIXES:
+        return None
+    laspy = _laspy(path, None)
+    with _reading(path), laspy.open(path) as reader:
+        texts = [record.string for record in reader.header.vlrs.get("WktCoordinateSystemVlr")]
+        keys = [key for record in reader.header.vlrs.get("GeoKeyDirectoryVlr") for key in record.geo_keys]
+    codes = {key.id: f"EPSG:{key.value_offset}" for key in keys if 0 < key.value_offset < USER_DEFINED}
+    words = [*(text.rstrip("\0") for text in texts), *(codes[name] for name in GEO_KEYS if name in codes)]
+    return next(filter(None, words), None)
 
 
 def _check_sizes(path: Path) -> None:

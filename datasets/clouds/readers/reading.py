@@ -15,6 +15,7 @@ from ...files import readable
 from ..point_cloud import PointCloud, usable_rows
 from .columns import CloudStream
 from .e57 import read_e57
+from .las import SUFFIXES as _LAS
 from .las import LasStream, read_las
 from .meshes import read_obj, read_off, read_stl
 from .pcd import read_pcd
@@ -39,7 +40,6 @@ TABLE_READERS: dict[str, Callable[[Path, str | None], PointCloud]] = {
 }
 """What reads which extension as a cloud, with the names of its columns where the file has none."""
 
-_LAS = (".las", ".laz")
 
 CLOUD_SUFFIXES: tuple[str, ...] = (*TABLE_READERS, *(end for end in MESH_READERS if end not in TABLE_READERS), *_LAS)
 """Extensions that `read_cloud` knows."""

@@ -1,0 +1,185 @@
+"""A surface too fine for memory: marching cubes on one lattice, part by part, with what parts share made equal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend.errors import positive
+from ..fields.field import FieldLike, solid
+from ._cells import CORNERS, Bounds, Floats, Given, Ints, Lattice, NoSurfaceError, Progress, Sampler, cull_blocks
+from .extract import DEFAULT_BOUNDS, extract_surface
+from .mesh import Mesh
+
+Place = tuple[int, int, int]
+
+_COLUMNS = (
+    ((3,), np.int64),
+    ((), np.float32),
+    ((), np.int64),
+    ((3,), np.float64),
+    ((3,), np.float32),
+)  # of a `_Border`
+_AROUND = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), -1).reshape(27, 3)
+
+
+class Part(NamedTuple):
+    """The surface in one cube of a lattice.
+
+    Attributes:
+        place: ``(3,)`` number of the cube along each axis, from the lowest corner.
+        mesh: its vertices on sides of the cube are repeated by its neighbours there, equal to the last bit.
+        shared: ``(S,)`` rows of these vertices.
+        edges: ``(S,)`` numbers of their lattice edges, by which the neighbours know them.
+    """
+
+    place: Place
+    mesh: Mesh
+    shared: NDArray[np.intp]
+    edges: NDArray[np.int64]
+
+
+class _Border(NamedTuple):
+    """What a part knows of its sides: lattice points and values; crossed edges, their vertices and normals."""
+
+    points: Ints
+    values: Floats
+    edges: Ints
+    vertices: NDArray[np.float64]
+    normals: NDArray[np.floating]
+
+
+def extract_parts(
+    field: FieldLike,
+    *,
+    resolution: int,
+    cells: int = 128,
+    level: int = -1,
+    bounds: Bounds = DEFAULT_BOUNDS,
+    lipschitz: float = 1.25,
+    clearance: float = 1e-3,
+    batch: int = 1 << 18,
+    progress: Progress | None = None,
+) -> Iterator[Part]:
+    """The surface that `extract_mesh` extracts, in cubes of ``cells`` cells, one after the other.
+
+    A part takes values and vertices at its sides from neighbours that came before. If it crosses a side where an
+    earlier one does not, as it may where |∇f| > L, that one is extracted again: it comes a second time, and replaces
+    the first. So in the end the parts, joined at shared vertices, are watertight inside the box. Memory is that of one
+    part, and of the sides of all.
+
+    Args:
+        field: as for `extract_mesh`.
+        resolution: cells along the longest axis of the box.
+        cells: cells along each edge of a cube, a power of two.
+        level: the level whose zero set is wanted.
+        bounds: lowest and highest corner of the box.
+        lipschitz: L, as for `extract_mesh`.
+        clearance: least distance of a vertex from the ends of its edge, in cells.
+        batch: points per call of the field.
+        progress: called with ``("parts", done, total)`` after every part.
+
+    Raises:
+        NoSurfaceError: no part has a surface.
+        ValueError: an argument is out of range, or the field is not finite.
+
+    Example:
+        >>> from mplicits.neural_fields import Sphere
+        >>> from mplicits.neural_fields.meshing.parts import extract_parts
+        >>> len(list(extract_parts(Sphere(radius=0.5), resolution=64, cells=32)))
+        8
+    """
+    field = solid(field)
+    positive(lipschitz=lipschitz, batch=batch)
+    if cells < 2 or cells & (cells - 1):
+        raise ValueError(f"cells={cells}: expected a power of two, at least 2")
+    level = field.resolve_level(level)
+    slope = field.slope_bound(lipschitz)
+    lattice = Lattice.over(bounds, resolution)
+    size = np.array(lattice.shape) + 1
+    blocks, _, kept = cull_blocks(Sampler(field, lattice, batch), level=level, lipschitz=slope, smallest=cells)
+    waiting = dict.fromkeys(map(tuple, np.unique(blocks[kept] // cells, axis=0).tolist()))
+    borders: dict[Place, _Border] = {}
+    done = 0
+    while waiting:
+        place: Place = next(iter(waiting))
+        del waiting[place]
+        part = lattice.part(np.array(place) * cells, cells)
+        beside = np.array(place) + _AROUND
+        around = [
+            tuple(each) for each in beside[((beside >= 0) & (beside * cells < lattice.shape)).all(axis=1)].tolist()
+        ]
+        known = [borders[each] for each in around if each in borders]
+        try:
+            found, border = _part(Sampler(field, part, batch), size, place, known, level, slope, clearance=clearance)
+        except NoSurfaceError:
+            found, border = None, None
+        done += 1
+        if progress is not None:
+            progress("parts", done, done + len(waiting))
+        if found is None or border is None:
+            continue
+        borders[place] = border
+        starts, ends = _ends(border.edges, size)
+        for other in around:
+            box = lattice.part(np.array(other) * cells, cells)
+            mine = border.edges[_inside(starts, box) & _inside(ends, box)]
+            theirs = borders[other].edges if other in borders else ()
+            if len(np.setdiff1d(mine, theirs)):
+                waiting[other] = None
+        yield found
+    if not borders:
+        raise NoSurfaceError(f"no surface in any of {done} parts of the box {lattice}")
+
+
+def _inside(points: Ints, box: Lattice) -> NDArray[np.bool_]:
+    """Which points ``(N, 3)`` of the whole lattice lie in a part of it, or on its sides."""
+    return ((points >= box.first) & (points <= np.add(box.first, box.shape))).all(axis=1)
+
+
+def _ends(edges: Ints, size: NDArray[np.int64]) -> tuple[Ints, Ints]:
+    """Both lattice points ``(N, 3)`` of numbered edges."""
+    at, along = np.divmod(edges, 3)
+    starts = np.stack(np.unravel_index(at, tuple(size)), axis=1)
+    return starts, starts + (np.arange(3) == along[:, None])
+
+
+def _part(
+    sampler: Sampler,
+    size: NDArray[np.int64],
+    place: Place,
+    known: list[_Border],
+    level: int,
+    slope: float,
+    *,
+    clearance: float,
+) -> tuple[Part, _Border]:
+    """A part that takes what is ``known`` of its border, and all that is known of that then.
+
+    ``size`` ``(3,)`` counts the points of the whole lattice.
+    """
+    lattice = sampler.lattice
+    first, shape = np.array(lattice.first), np.array(lattice.shape)
+    none = _Border(*(np.empty((0, *columns), kind) for columns, kind in _COLUMNS))
+    points, values, edges, places, directions = (np.concatenate(each) for each in zip(none, *known, strict=True))
+    within = _inside(points, lattice)
+    edges, chosen = np.unique(edges, return_index=True)
+    starts, stops = _ends(edges, size)
+    corners = (starts - first)[:, None] - CORNERS * (starts == stops)[:, None]
+    blocks = corners[_inside(starts, lattice) & _inside(stops, lattice)].reshape(-1, 3) // 2 * 2
+    crossed = np.unique(blocks[((blocks >= 0) & (blocks < shape)).all(axis=1)], axis=0)
+    given = Given(points[within] - first, values[within], crossed)
+    mesh, active, ends = extract_surface(sampler, level, slope, normals=True, clearance=clearance, given=given)
+    low, high = active.points[ends[:, 0]].astype(np.int64), active.points[ends[:, 1]]
+    flat = low == high  # on the axes that an edge does not run along
+    shared = np.flatnonzero((flat & ((low == 0) | (low == shape))).any(axis=1))
+    own = 3 * np.ravel_multi_index(tuple((low[shared] + first).T), tuple(size)) + flat[shared].argmin(axis=1)
+    _, mine, theirs = np.intersect1d(own, edges, assume_unique=True, return_indices=True)
+    assert mesh.normals is not None
+    mesh.vertices[shared[mine]], mesh.normals[shared[mine]] = places[chosen[theirs]], directions[chosen[theirs]]
+    on_sides, asked = active.on_sides
+    border = _Border(on_sides + first, asked, own, mesh.vertices[shared], mesh.normals[shared])
+    return Part(place, mesh, shared, own), border

@@ -1,0 +1,310 @@
+"""A surface as 3D Tiles 1.1: cubes of lattices, coarse to fine, each a GLB, and the tree of them for web viewers."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from ...datasets import spacing_of
+from ...datasets.clouds.point_cloud import unit_rows
+from ...neural_fields import InputError, Mesh, Similarity
+from ...neural_fields.backend.files import check_place, partial_of, rename, write_json
+from ...neural_fields.fields.similarity import Placement
+from ...neural_fields.meshing._cells import Bounds
+from ...neural_fields.meshing.extract import DEFAULT_BOUNDS, surface_needed
+from ...neural_fields.meshing.mesh import write_glb_mesh
+from ...neural_fields.meshing.parts import Place, extract_parts
+from ..surface.surface import Footing, Support, component_of_faces, footing, keep_faces, read_support
+from ..texture.transport import Colors, colors_of_run
+from ..training.folder import TEXTURE_FILE, chosen_level, find_field, load_still
+from ..training.progress import Report, counted, silent
+from .atlas import deviation
+from .earth import Stand, on_globe, upright
+from .extract import chosen_resolution
+from .files import placement_of
+
+SCENE_FILE = "tileset.json"
+SEEN = 10_000  # points of each mesh at which errors are measured: of the Armadillo, 50,000 find the same
+PARTS = "parts"  # folder of the meshes, while a scene is written
+_CUBE = list(itertools.product((0, 1), repeat=3))
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """How a run becomes 3D Tiles.
+
+    Attributes:
+        resolution: cells along the side of the cube around the unit sphere, at the finest; None as in `MeshOptions`.
+        level: of the finest tiles, counted from 0, the coarsest; None is the finest. Tiles of twice the size have the
+            level before.
+        colors: whether vertices get the colours of the run's texture, if it has one.
+        keep_unsupported: whether to keep components that no input points support.
+        up: the axis that points up in the input, "y" or "z"; see `Placement`, as for ``unit``.
+        unit: length of one input unit.
+        crs: coordinate reference system of the input, as pyproj takes it; None is that of the cloud's file, if any.
+        cells: cells along each edge of a tile, a power of two.
+    """
+
+    resolution: int | None = None
+    level: int | None = None
+    colors: bool = True
+    keep_unsupported: bool = False
+    up: str | None = None
+    unit: str | None = None
+    crs: str | None = None
+    cells: int = 128
+
+
+class Scene(NamedTuple):
+    """What was written: tiles, steps of detail, triangles of the finest one, the coarsest one's error in metres."""
+
+    tiles: int
+    steps: int
+    faces: int
+    error: float
+
+
+class _Tile(NamedTuple):
+    """An entry of the tree, and what its parent needs: the corners of its box, and its error."""
+
+    entry: dict[str, Any]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    error: float
+
+
+def scene_of_run(
+    run: str | Path,
+    out: str | Path,
+    options: SceneOptions | None = None,
+    *,
+    say: Callable[[str], None] | None = None,
+    report: Report | None = None,
+) -> Scene:
+    """Write the surface of a run as 3D Tiles 1.1 into the folder ``out``: ``tileset.json`` and a GLB for each tile.
+
+    Tiles are cubes of a lattice, `extract_parts`; each has up to eight of half the size that replace it. The geometric
+    error of a tile is its largest distance to those, both ways, plus theirs. Tiles of one size meet without gaps.
+    Memory is that of nine tiles, and of the support.
+
+    Raises:
+        InputError: there is no such run or level, it has no surface, the folder holds something else, or the coordinate
+            system is unknown.
+    """
+    options, out, say = options or SceneOptions(), Path(out), say or (lambda _: None)
+    placement = placement_of(options.up, options.unit, False)
+    check_place(out)
+    if out.exists() and not (out / SCENE_FILE).is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: holds something that is no 3D Tiles scene; name another folder")
+    file = find_field(run)
+    field, similarity, metadata = load_still(file)
+    level = chosen_level(field, file, options.level)
+    support = read_support(file, metadata.get("run", {}), level)
+    stand = _stand(options, placement, similarity, metadata.get("run", {}), file)
+    say(f"coordinates: {stand.line}")
+    resolution = chosen_resolution(field, options.resolution, support, level, say)
+    bounds, cells, steps = _lattice(support, resolution, options.cells)
+    colored = options.colors and file.with_name(TEXTURE_FILE).is_file()
+    colors = colors_of_run(file, field, None) if colored else None
+    partial = partial_of(out)
+    try:
+        with surface_needed(f"{file}: no surface to mesh"):
+            for step in range(steps):
+                folder = partial / PARTS / str(step)
+                folder.mkdir(parents=True)
+                size, used = cells // 2**step, max(0, level - step)
+                show = counted(report or silent, f"tiles of {size} cells per side")
+                for part in extract_parts(
+                    field,
+                    resolution=size,
+                    cells=options.cells,
+                    level=used,
+                    bounds=bounds,
+                    progress=lambda _, done, total, show=show: show(done, total),
+                ):
+                    _keep(folder, part.place, part.mesh, shared=part.shared, edges=part.edges)
+                if support is not None and not support.visible and not options.keep_unsupported:
+                    _drop_unsupported(folder, support)
+        writer = _Writer(partial, stand, similarity, colors, counted(report or silent, "writing tiles"))
+        root = writer.tile(steps - 1, (0, 0, 0))
+        assert root is not None
+        extent = float(np.linalg.norm(root.high - root.low))
+        root.entry["transform"] = stand.transform.T.ravel().tolist()  # column by column
+        root.entry["refine"] = "REPLACE"
+        scene = {"asset": {"version": "1.1"}, "geometricError": max(extent, root.error), "root": root.entry}
+        shutil.rmtree(partial / PARTS)
+        write_json(partial / SCENE_FILE, scene)
+        shutil.rmtree(out, ignore_errors=True)  # an older scene
+        rename(partial, out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return Scene(writer.tiles, steps, writer.faces, root.error)
+
+
+def _stand(
+    options: SceneOptions, placement: Placement, similarity: Similarity, record: dict[str, Any], file: Path
+) -> Stand:
+    crs = options.crs or record.get("crs")
+    if crs is None:
+        return upright(placement, similarity.center)
+    if options.up == "y" or options.unit is not None:
+        flag = "--unit" if options.unit else "--up y"
+        raise InputError(f"{flag}: {file} has coordinates on the globe, whose axes and units are known; leave it out")
+    return on_globe(crs, similarity.center)
+
+
+def _lattice(support: Support | None, resolution: int, cells: int) -> tuple[Bounds, int, int]:
+    """The box of a scene, cells along its longest side, and steps of detail until one tile holds all."""
+    low, high = np.array(DEFAULT_BOUNDS)
+    edge = float((high - low).max()) / resolution
+    if support is not None:
+        least, most = support.points.min(axis=0), support.points.max(axis=0)
+        room = support.radius + 0.05 * float((most - least).max())  # a surface bulges where nothing was measured
+        low, high = np.maximum(low, least - room), np.minimum(high, most + room)
+    across = max(1, math.ceil(float((high - low).max()) / edge))
+    steps = 1 + max(0, math.ceil(math.log2(across / cells)))
+    multiple = 2 ** (steps - 1)
+    across = max(2, -(-across // multiple) * multiple)  # cells of all steps end at the same places
+    high = np.maximum(high, np.where((high - low) == (high - low).max(), low + across * edge, high))
+    x, y, z = low.tolist()
+    i, j, k = high.tolist()
+    return ((x, y, z), (i, j, k)), across, steps
+
+
+def _path(folder: Path, place: Place) -> Path:
+    return folder / f"{'_'.join(map(str, place))}.npz"
+
+
+def _keep(folder: Path, place: Place, mesh: Mesh, **more: NDArray[Any]) -> None:
+    assert mesh.normals is not None
+    np.savez(_path(folder, place), vertices=mesh.vertices, faces=mesh.faces, normals=mesh.normals, **more)
+
+
+def _kept(path: Path) -> tuple[Mesh, NDArray[Any], NDArray[Any]]:
+    """The mesh of a file, and of its vertices that are shared with others the rows and the lattice edges."""
+    with np.load(path) as stored:
+        mesh = Mesh(stored["vertices"], stored["faces"], stored["normals"])
+        return mesh, stored["shared"], stored["edges"]
+
+
+def _drop_unsupported(folder: Path, support: Support) -> None:
+    """Drop the components, followed from part to part, that no points support; see `drop_unsupported`."""
+    paths = sorted(folder.iterdir())
+    tree, total = KDTree(support.points), 0
+    numbers: list[NDArray[np.intp]] = []
+    edges, owners, found = [], [], []
+    for path in paths:
+        mesh, shared, lattice_edges = _kept(path)
+        number = component_of_faces(mesh)
+        of_vertex = np.zeros(len(mesh.vertices), np.int64)
+        of_vertex[mesh.faces] = number[:, None]
+        edges.append(lattice_edges)
+        owners.append(of_vertex[shared] + total)
+        numbers.append(number + total)
+        found.append(footing(mesh, number, tree, support.radius))
+        total += len(found[-1].area)
+    order = np.argsort(edge := np.concatenate(edges), kind="stable")
+    owner = np.concatenate(owners)[order]
+    met = edge[order][1:] == edge[order][:-1]
+    graph = coo_array((np.ones(met.sum(), np.int8), (owner[:-1][met], owner[1:][met])), shape=(total, total))
+    whole = connected_components(graph, directed=False)[1]
+    sums = Footing(*(np.bincount(whole, np.concatenate(each)) for each in zip(*found, strict=True)))
+    stands = sums.stands(spacing_of(support.points))
+    if not stands.any():
+        return
+    for path, number in zip(paths, numbers, strict=True):
+        kept = stands[whole[number]]
+        if not kept.any():
+            path.unlink()
+        elif not kept.all():
+            x, y, z = map(int, path.stem.split("_"))
+            nothing = np.empty(0, np.int64)
+            _keep(folder, (x, y, z), keep_faces(_kept(path)[0], kept), shared=nothing, edges=nothing)
+
+
+class _Writer:
+    """Writes tiles from the finest up, and counts them."""
+
+    def __init__(
+        self,
+        out: Path,
+        stand: Stand,
+        similarity: Similarity,
+        colors: Colors | None,
+        show: Callable[[int, int], None],
+    ) -> None:
+        self.out, self.stand, self.similarity, self.colors, self.show = out, stand, similarity, colors, show
+        self.total = sum(1 for _ in (out / PARTS).rglob("*.npz"))
+        self.tiles = self.faces = 0
+
+    def tile(self, step: int, place: Place) -> _Tile | None:
+        """A tile with those below it; None where there is nothing."""
+        x, y, z = place
+        below: list[Place] = [(2 * x + i, 2 * y + j, 2 * z + k) for i, j, k in _CUBE] if step else []
+        children = [tile for each in below if (tile := self.tile(step - 1, each)) is not None]
+        path = _path(self.out / PARTS / str(step), place)
+        mesh = _kept(path)[0] if path.is_file() else None
+        if mesh is None and not children:
+            return None
+        lows, highs = [tile.low for tile in children], [tile.high for tile in children]
+        entry: dict[str, Any] = {}
+        if mesh is not None:
+            placed = self._placed(mesh)
+            lows.append(placed.vertices.min(axis=0))
+            highs.append(placed.vertices.max(axis=0))
+            entry["content"] = {"uri": self._write(step, place, placed)}
+        low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+        error = 0.0
+        if children:
+            finer = [
+                _kept(each)[0] for each in (_path(self.out / PARTS / str(step - 1), p) for p in below) if each.is_file()
+            ]
+            apart = float(np.linalg.norm(high - low))  # where there is nothing coarse, all may be missed
+            if mesh is not None and finer:
+                apart = deviation(_joined(finer), mesh, probes=SEEN)[0] * self.similarity.scale * self.stand.metres
+            error = apart + max(tile.error for tile in children)
+            entry["children"] = [tile.entry for tile in children]
+        middle, half = (low + high) / 2, (high - low) / 2
+        box = [*middle.tolist(), *np.diag(half).ravel().tolist()]
+        return _Tile({"boundingVolume": {"box": box}, "geometricError": error} | entry, low, high, error)
+
+    def _placed(self, mesh: Mesh) -> Mesh:
+        assert mesh.normals is not None
+        colors = None
+        if self.colors is not None:
+            colors = self.colors(torch.from_numpy(mesh.vertices).float()).numpy()
+        vertices = self.stand.points(self.similarity.to_input(mesh.vertices))
+        normals = unit_rows(mesh.normals @ self.stand.turn.T).astype(np.float32)
+        return dataclasses.replace(mesh, vertices=vertices, normals=normals, colors=colors)
+
+    def _write(self, step: int, place: Place, mesh: Mesh) -> str:
+        name = f"tiles/{step}/{'_'.join(map(str, place))}.glb"
+        path = self.out / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        x, y, z = ((low + high) / 2).tolist()
+        home = Similarity((x, y, z), float(np.linalg.norm(high - low)) / 2 or 1.0)
+        write_glb_mesh(path, mesh, home, Placement("z", "m"))
+        self.tiles += 1
+        self.faces += len(mesh.faces) if step == 0 else 0
+        self.show(self.tiles, self.total)
+        return name
+
+
+def _joined(meshes: list[Mesh]) -> Mesh:
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))

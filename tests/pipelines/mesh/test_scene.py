@@ -1,0 +1,150 @@
+"""3D Tiles: what is in the tree, that it holds the surface, and where it stands on the globe."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from mplicits.neural_fields import InputError, Similarity, Sphere, Union, save_field
+from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.mesh.scene import SceneOptions, scene_of_run
+
+HOME = Similarity((512_345.0, 5_403_210.0, 312.5), 40.0)  # metres of UTM zone 32
+
+
+@pytest.fixture
+def run(tmp_path):
+    path = tmp_path / "field.safetensors"
+    save_field(path, Sphere(radius=0.8), similarity=HOME)
+    return path
+
+
+def entries(entry):
+    yield entry
+    for child in entry.get("children", []):
+        yield from entries(child)
+
+
+def box_of(entry):
+    numbers = np.array(entry["boundingVolume"]["box"])
+    half = np.abs(numbers[3:].reshape(3, 3)).sum(axis=0)
+    return numbers[:3] - half, numbers[:3] + half
+
+
+def content_of(folder, entry):
+    """The mesh of a tile, turned z-up as viewers of 3D Tiles do."""
+    scene = trimesh.load(folder / entry["content"]["uri"])
+    mesh = scene.to_geometry() if isinstance(scene, trimesh.Scene) else scene
+    vertices = np.stack((mesh.vertices[:, 0], -mesh.vertices[:, 2], mesh.vertices[:, 1]), axis=1)
+    return trimesh.Trimesh(vertices, mesh.faces, process=False)
+
+
+def test_the_tree_holds_the_surface_coarse_to_fine(run, tmp_path):
+    out = tmp_path / "scene"
+    scene = scene_of_run(run, out, SceneOptions(resolution=64, cells=16))
+    assert sorted(path.name for path in out.iterdir()) == ["tiles", "tileset.json"]
+    tree = json.loads((out / "tileset.json").read_text())
+    assert tree["asset"]["version"] == "1.1"
+    root = tree["root"]
+    assert root["refine"] == "REPLACE"
+    assert np.allclose(np.reshape(root["transform"], (4, 4)).T[:3, 3], HOME.center)
+    tiles = list(entries(root))
+    assert len(tiles) == scene.tiles
+    assert tree["geometricError"] >= root["geometricError"]
+    fine = []
+    for tile in tiles:
+        low, high = box_of(tile)
+        for child in tile.get("children", []):
+            assert child["geometricError"] <= tile["geometricError"]
+            assert (box_of(child)[0] >= low - 1e-9).all()
+            assert (box_of(child)[1] <= high + 1e-9).all()
+        mesh = content_of(out, tile)
+        room = 1e-6 * HOME.scale  # float32 of coordinates up to 40
+        assert (mesh.vertices >= low - room).all()
+        assert (mesh.vertices <= high + room).all()
+        if "children" not in tile:
+            assert tile["geometricError"] == 0
+            fine.append(mesh)
+    whole = trimesh.util.concatenate(fine)
+    whole.merge_vertices(digits_vertex=4)  # a ten-thousandth of a metre, where cells have 1.3 metres
+    assert whole.is_watertight
+    assert np.linalg.norm(whole.vertices, axis=1) == pytest.approx(32, abs=1e-3)
+    # Chords of coarser cells: h² / 8r for an edge of h, and three times that on the diagonal of a cell.
+    step = 2.04 * HOME.scale / 64
+    coarse = step * 2 ** (scene.steps - 1)
+    assert 0 < root["geometricError"] < 3 * coarse**2 / (8 * 32) + 3 * (coarse / 2) ** 2 / (8 * 32) + coarse / 100
+
+
+def test_parts_without_points_go_as_from_a_mesh(tmp_path, monkeypatch):
+    """A ball with points and a ball without, which reaches through several tiles."""
+    from mplicits.pipelines.mesh import scene
+    from mplicits.pipelines.surface.surface import Support
+
+    run = tmp_path / "field.safetensors"
+    save_field(run, Union(Sphere(center=(-0.5, 0, 0), radius=0.3), Sphere(center=(0.5, 0, 0), radius=0.3)))
+    directions = np.random.default_rng(0).normal(size=(4000, 3))
+    points = 0.3 * directions / np.linalg.norm(directions, axis=1, keepdims=True) - (0.5, 0, 0)
+    wide = np.concatenate((points, [(0.9, 0.4, 0.4)]))  # a stray, so that the box holds both
+    monkeypatch.setattr(scene, "read_support", lambda *_: Support(wide, 0.05))
+    for keep, volume in ((False, 1), (True, 2)):
+        out = tmp_path / f"scene{keep}"
+        scene_of_run(run, out, SceneOptions(resolution=64, cells=16, keep_unsupported=keep))
+        tree = json.loads((out / "tileset.json").read_text())["root"]
+        meshes = [content_of(out, tile) for tile in entries(tree) if "children" not in tile]
+        found = sum(mesh.triangles_center[:, 0].size for mesh in meshes)
+        right = sum((mesh.triangles_center[:, 0] > 0).sum() for mesh in meshes)
+        assert (right > 0) == keep
+        assert found / (found - right) == pytest.approx(volume, rel=0.05)
+
+
+def test_on_the_globe_every_vertex_is_where_its_system_says(run, tmp_path):
+    pyproj = pytest.importorskip("pyproj")
+    out = tmp_path / "scene"
+    scene_of_run(run, out, SceneOptions(resolution=48, cells=64, crs="EPSG:25832"))
+    tree = json.loads((out / "tileset.json").read_text())["root"]
+    matrix = np.reshape(tree["transform"], (4, 4)).T
+    mesh = content_of(out, tree)
+    earth = mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    back = pyproj.Transformer.from_crs("EPSG:4978", pyproj.CRS("EPSG:25832").to_3d(), always_xy=True)
+    x, y, z = back.transform(*earth.T)
+    points = (np.stack((x, y, z), axis=1) - HOME.center) / HOME.scale
+    # One float32 step of the coordinates, and the chords of cells of 1.7 metres on a ball of 32.
+    assert np.linalg.norm(points, axis=1) == pytest.approx(0.8, abs=1e-4)
+    assert np.allclose(matrix[:3, :3].T @ matrix[:3, :3], np.eye(3), atol=1e-12)
+    assert matrix[:3, 2] @ matrix[:3, 3] / np.linalg.norm(matrix[:3, 3]) > 0.99  # up is away from the globe
+
+
+def test_units_and_axes_without_a_system(run, tmp_path):
+    out = tmp_path / "scene"
+    scene_of_run(run, out, SceneOptions(resolution=32, cells=32, up="y", unit="mm"))
+    tree = json.loads((out / "tileset.json").read_text())["root"]
+    assert np.linalg.norm(content_of(out, tree).vertices, axis=1) == pytest.approx(0.032, rel=1e-3)
+    x, y, z = np.array(HOME.center) / 1000
+    assert np.reshape(tree["transform"], (4, 4)).T[:3, 3] == pytest.approx((x, -z, y))
+
+
+def test_an_older_scene_is_replaced_and_nothing_else(run, tmp_path, capsys):
+    out = tmp_path / "scene"
+    command = ["mesh", str(run), "-o", str(out), "--format", "3dtiles", "--resolution", "24"]
+    assert main(command) == 0
+    (out / "old").touch()
+    assert main(command) == 0
+    assert not (out / "old").exists()
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "thesis.tex").touch()
+    assert main([*command[:3], str(full), *command[4:]]) == 2
+    assert main([*command, "--keep-largest"]) == 2
+    assert main([*command[:4], "--crs", "EPSG:25832"]) == 2
+    assert main([*command, "--crs", "Middle-earth"]) == 2
+    assert (full / "thesis.tex").is_file()
+    errors = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert len(errors) == 4
+
+
+def test_a_place_outside_of_the_system_is_refused(tmp_path):
+    pytest.importorskip("pyproj")
+    run = tmp_path / "field.safetensors"
+    save_field(run, Sphere(radius=0.8), similarity=Similarity((5e9, 5e9, 0.0), 40.0))
+    with pytest.raises(InputError, match="outside"):
+        scene_of_run(run, tmp_path / "scene", SceneOptions(resolution=24, crs="EPSG:25832"))
