@@ -44,13 +44,13 @@ def upright(placement: Placement, origin: tuple[float, float, float]) -> Stand:
 
 
 def on_globe(crs: str, origin: tuple[float, float, float]) -> Stand:
-    """A scene in a coordinate reference system, x east or longitude first: axes east, north and up at its ``origin``.
+    """A scene in a projected coordinate reference system, x first: axes east, north and up at its ``origin``.
 
     Every point goes through the system exactly, so the curvature of the globe is in the scene. Heights are as they are:
     those of a system without an ellipsoid of its own count from the ellipsoid WGS 84.
 
     Raises:
-        InputError: pyproj is missing, it knows no such system, or the origin is not in its area.
+        InputError: pyproj is missing, it knows no such system, the system has degrees, or the origin is not in its area.
     """
     try:
         import pyproj
@@ -64,6 +64,9 @@ def on_globe(crs: str, origin: tuple[float, float, float]) -> Stand:
         )
     except pyproj.exceptions.ProjError as error:
         raise InputError(f"--crs {crs[:80]}: is no coordinate system that pyproj knows; try EPSG:NUMBER") from error
+
+    if not system.is_projected:
+        raise InputError(f"--crs {system.name}: has no lengths along its axes; fit a cloud in a projected system")
 
     def globe(points: Float64) -> Float64:
         return np.stack(geocentric.transform(*np.asarray(points, np.float64).T), axis=-1)
@@ -81,8 +84,6 @@ def on_globe(crs: str, origin: tuple[float, float, float]) -> Stand:
     def points(rows: Float64) -> Float64:
         return (globe(rows) - center) @ transform[:3, :3]
 
-    step = 1e-5 if system.is_geographic else 1.0  # about a metre, on which the system is linear
-    steps = step * np.eye(3)
-    slope = (points(origin + steps) - points(origin - steps)).T / (2 * step)  # ∂scene / ∂input
+    slope = (points(origin + np.eye(3)) - points(origin - np.eye(3))).T / 2  # ∂scene / ∂input, constant over metres
     metres = float(np.cbrt(abs(np.linalg.det(slope))))
     return Stand(points, np.linalg.inv(slope).T, metres, transform, f"on the globe, by {system.name}")

@@ -146,5 +146,6 @@ def test_a_place_outside_of_the_system_is_refused(tmp_path):
     pytest.importorskip("pyproj")
     run = tmp_path / "field.safetensors"
     save_field(run, Sphere(radius=0.8), similarity=Similarity((5e9, 5e9, 0.0), 40.0))
-    with pytest.raises(InputError, match="outside"):
-        scene_of_run(run, tmp_path / "scene", SceneOptions(resolution=24, crs="EPSG:25832"))
+    for crs, complaint in (("EPSG:25832", "outside"), ("EPSG:4326", "lengths")):
+        with pytest.raises(InputError, match=complaint):
+            scene_of_run(run, tmp_path / "scene", SceneOptions(resolution=24, crs=crs))

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from mplicits.datasets import PointCloud, read_cloud, write_cloud_ply
 from mplicits.datasets.clouds.point_cloud import unit_rows
+from mplicits.datasets.clouds.readers.las import coordinate_system
 from mplicits.datasets.clouds.readers.reading import open_stream, read_mesh
 from mplicits.neural_fields import InputError
 from refusals import refused
@@ -414,3 +415,19 @@ def test_failed_write_leaves_nothing(tmp_path, cloud):
 def test_point_cloud_checks_its_shapes(arrays, message):
     with pytest.raises(ValueError, match=message):
         PointCloud(*arrays)
+
+
+@pytest.mark.parametrize(("version", "form"), [("1.2", 3), ("1.4", 7)])
+def test_las_files_name_their_coordinate_system(tmp_path, version, form):
+    """In keys of GeoTIFF, or as WKT; and files that name none."""
+    laspy, pyproj = pytest.importorskip("laspy"), pytest.importorskip("pyproj")
+    for name, system in (("named.las", pyproj.CRS("EPSG:25832")), ("bare.las", None)):
+        header = laspy.LasHeader(point_format=form, version=version)
+        if system is not None:
+            header.add_crs(system)
+        cloud = laspy.LasData(header)
+        cloud.x = cloud.y = cloud.z = np.arange(5.0)
+        cloud.write(tmp_path / name)
+        found = coordinate_system(tmp_path / name)
+        assert found is None if system is None else pyproj.CRS(found) == system
+    assert coordinate_system(tmp_path / "cloud.ply") is None
