@@ -30,6 +30,7 @@ from mplicits.neural_fields.backend.devices import (
 )
 from mplicits.neural_fields.meshing.extract import DEFAULT_BOUNDS, extract_mesh
 from mplicits.neural_fields.networks.multiscale import levels_of
+from mplicits.neural_fields.networks.siren import block_rows
 from mplicits.pipelines.training.folder import find_field
 from mplicits.pipelines.training.trainer import seeded
 from numpy.typing import NDArray
@@ -139,7 +140,7 @@ class NormalsBench(Benchmark[NormalsRow]):
             printed, tangents = (seconds(partial(way, network)) for way in (printed_jet, tangent_jet))
         autograd = seconds(partial(_autograd_jet, network))
         flops = 2 * 2 * self.points * ((depth - 1) * width**2 + 4 * width)
-        gemm = flops / sgemm_rate(width, rows=network.block_rows(x.device), device=x.device)
+        gemm = flops / sgemm_rate(width, rows=block_rows(width, x.device), device=x.device)
         apart = _largest_difference(network, x[:4096])
         return NormalsRow(
             width,
@@ -267,7 +268,7 @@ def _over_blocks(network: Siren, x: Tensor, step: Callable[[Sequence[Tensor], sl
     def prepare(rows: int) -> Callable[[slice], None]:
         return partial(step, [x.new_empty(rows, network.width) for _ in range(buffers)])
 
-    over_blocks(len(x), network.block_rows(x.device), prepare, like=x)
+    over_blocks(len(x), block_rows(network.width, x.device), prepare, like=x)
 
 
 @contextmanager

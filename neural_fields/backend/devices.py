@@ -333,11 +333,11 @@ def peak_memory() -> int | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def choose_device(name: str, *, option: str = "--device") -> torch.device:
+def choose_device(name: str) -> torch.device:
     """The device of this name; ``auto`` is CUDA where there is a working GPU, the CPU elsewhere.
 
     Raises:
-        InputError: no such device here; the message names the ``option``.
+        InputError: no such device here.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -346,5 +346,5 @@ def choose_device(name: str, *, option: str = "--device") -> torch.device:
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"{option} {name}: not usable here ({reason}); use auto or cpu") from error
+        raise InputError(f"--device {name}: not usable here ({reason}); use auto or cpu") from error
     return device

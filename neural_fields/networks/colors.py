@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from ..backend.errors import at_least, positive
 from ..fields.field import Field, Jet, OneLevelField
 from .grids import HashEncoding
-from .siren import Siren, forward, needs_graph, plain_jet
+from .siren import Siren, block_rows, forward, needs_graph, plain_jet
 
 
 def encode(x: Tensor, frequencies: int) -> Tensor:
@@ -209,7 +209,8 @@ class ColorSiren(nn.Module):
         parameters = self.siren.folded()
         blocks = [rows]
         if not needs_graph(rows[0], [*rows[1:], *parameters]):
-            blocks = zip(*(part.split(self.siren.block_rows(part.device)) for part in rows), strict=True)
+            size = block_rows(self.siren.width, rows[0].device)
+            blocks = zip(*(part.split(size) for part in rows), strict=True)
         results = [evaluate(*block, parameters) for block in blocks]
         joined = [torch.cat(parts) for parts in zip(*results, strict=True)]
         return [whole.reshape(*points[0].shape[:-1], *whole.shape[1:]) for whole in joined]

@@ -101,18 +101,15 @@ def launch(
     *,
     warps: int = 4,
     stages: int = 2,
-    registers: int | None = None,
     **constants: Any,
 ) -> None:
     """Launch as many programs of a kernel as the device holds at a time, at most ``tiles`` ≥ 1.
 
     How many a multiprocessor holds follows from the registers and shared memory of the compiled kernel; the first
-    launch, which compiles it, has one for each. ``arguments`` maps the number of programs to the kernel's arguments,
-    ``registers`` limits those of a thread, so that more programs run at a time, and ``constants`` are compiled in.
+    launch, which compiles it, has one for each. ``arguments`` maps the number of programs to the kernel's arguments;
+    ``constants`` are compiled in.
     """
     options = {**constants, "num_warps": warps, "num_stages": stages}
-    if registers is not None and like.is_cuda:
-        options["maxnreg"] = registers
     if not like.is_cuda:
         programs = min(tiles, INTERPRETED_PROGRAMS)
         kernel[(programs,)](*arguments(programs), **options)
