@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -90,16 +89,14 @@ def extract_mesh(
     level = field.resolve_level(level)
     lipschitz = field.slope_bound(lipschitz)
     sampler = Sampler(field, Lattice.over(bounds, resolution), batch, progress)
-    times = [time.perf_counter()]
     blocks, centres, kept = cull_blocks(sampler, level=level, lipschitz=lipschitz)
-    times.append(time.perf_counter())
     cells = active_cells(sampler, blocks, centres, kept, level=level, lipschitz=lipschitz)
-    times.append(time.perf_counter())
     faces, ends = _triangles(cells)
-    fractions = _crossing(cells.values[ends[:, 0]], cells.values[ends[:, 1]]).clip(clearance, 1 - clearance)
+    below = cells.values[ends[:, 0]].astype(np.float64)
+    # Where the line through the values at both ends, of different signs, is zero.
+    fractions = (below / (below - cells.values[ends[:, 1]])).clip(clearance, 1 - clearance)
     start, step = cells.points[ends[:, 0]], cells.points[ends[:, 1]] - cells.points[ends[:, 0]]
     vertices = sampler.lattice.positions(start + fractions[:, None] * step)
-    times.append(time.perf_counter())
     unit = None
     if normals:
         rising = cells.values[ends[:, 1]] > cells.values[ends[:, 0]]
@@ -114,11 +111,7 @@ def extract_mesh(
             fractions[moved] = stepped
             moved = moved[far]
             vertices = sampler.lattice.positions(start + fractions[:, None] * step)
-    times.append(time.perf_counter())
-    stages = ("cull", "corners", "triangles", "normals")
-    seconds = {stage: after - before for stage, before, after in zip(stages, times, times[1:], strict=False)}
-    stats = MeshStats(tuple(sampler.counts), int(kept.sum()), len(cells.cases), seconds)
-    return Mesh(vertices, faces, unit, stats=stats)
+    return Mesh(vertices, faces, unit, stats=MeshStats(tuple(sampler.counts), int(kept.sum()), len(cells.cases)))
 
 
 def surface_of(field: FieldLike, *, resolution: int, level: int = -1) -> Mesh | None:
@@ -150,11 +143,6 @@ def map_normals(mesh: Mesh, field: FieldLike, *, level: int = -1, batch: int = 1
     points = torch.from_numpy(mesh.vertices).to(field.like)
     gradients = [field.jet(part, level=level).gradient for part in points.split(batch)]
     return replace(mesh, normals=normalize(torch.cat(gradients), dim=-1).float().cpu().numpy())
-
-
-def _crossing(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Where the line through values at 0 and 1, of different signs, is zero."""
-    return low.astype(np.float64) / (low.astype(np.float64) - high)
 
 
 def _newton(

@@ -280,7 +280,8 @@ class TextureField(OneLevelField):
         raw, slope = self.network.jet(rows[inside])
         value = self._background(rows).index_copy(0, inside, raw.clamp(0, 1))
         gradient = rows.new_zeros(len(rows), 3, self.in_dim)
-        gradient = gradient.index_copy(0, inside, slope * _unclamped(raw)[..., None])
+        free = ((raw >= 0) & (raw <= 1)).to(raw.dtype)  # the derivative of the clamp
+        gradient = gradient.index_copy(0, inside, slope * free[..., None])
         shape = (*x.shape[:-1], 3)
         return Jet(value.reshape(shape), gradient.reshape(*shape, self.in_dim), x.new_empty((*x.shape[:-1], 0)))
 
@@ -297,11 +298,6 @@ class TextureField(OneLevelField):
 
     def _background(self, rows: Tensor) -> Tensor:
         return self.outside.to(rows).expand(len(rows), 3)
-
-
-def _unclamped(raw: Tensor) -> Tensor:
-    """1 where clamping to [0, 1] changes nothing, 0 elsewhere: the derivative of the clamp."""
-    return ((raw >= 0) & (raw <= 1)).to(raw.dtype)
 
 
 def _tangent(x: Tensor, v: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:

@@ -74,11 +74,6 @@ def multiprocessors(device: torch.device) -> int:
     return torch.cuda.get_device_properties(device).multi_processor_count
 
 
-def scratch_for(x: Tensor, programs: int, floats: int) -> Tensor:
-    """Uninitialised memory of ``floats`` numbers for each of ``programs`` programs."""
-    return torch.empty(programs * floats, dtype=torch.float32, device=x.device)
-
-
 def half_scratch(like: Tensor, numbers: int) -> Tensor:
     """Uninitialised memory for ``numbers`` float16 numbers, at least one."""
     return torch.empty(max(1, numbers), dtype=torch.float16, device=like.device)
