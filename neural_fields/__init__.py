@@ -48,7 +48,7 @@ _MOVED = {
     "spacetime.evolution": "Law curvature key_loss law_loss mean_curvature morph near_surface normal_speed transport",
     "spacetime.field": "SpaceTimeJet spacetime_jet",
     "spacetime.flow": "IntegrationError Solver trajectories",
-    "spacetime.moving": "Keyframes ShrinkingSphere",
+    "spacetime.moving": "Keyframes",
     "spacetime.velocity": "CarriedKeyframes Velocity VelocityJet VelocitySiren",
     "tracing.cones": "cone_starts",
     "tracing.sphere": "Hits Mapped map_attribute",

@@ -24,7 +24,6 @@ from mplicits.neural_fields import (
     extract_mesh,
     load_field,
 )
-from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.evolve.checks import slope_figures
 from mplicits.pipelines.evolve.shapes import Placed, Placement
 from mplicits.pipelines.evolve.train import evolve
@@ -38,6 +37,7 @@ from ..harness.benchmark import Benchmark, Part
 from ..harness.jobs import Context
 from ..harness.tables import Column, Figure, Table, tabulated
 from ..shapes.fits import fit_home, kept_fit
+from .figures import ShrinkingSphere
 
 TIMES = 20
 RESOLUTION = 64

@@ -20,6 +20,7 @@ from typing import Protocol
 import torch
 from mplicits.datasets.synthetic import solids
 from mplicits.neural_fields import Field, FunctionField, Jet
+from mplicits.neural_fields.fields.field import OneLevelField
 from torch import Tensor
 
 # Where a beam is so little bent (times the length of the arc: radians) its curvature is taken for this one; that shifts
@@ -298,3 +299,43 @@ def _turned(x: Tensor, angle: Tensor) -> Tensor:
     sine, cosine = angle.sin(), angle.cos()
     a, b = x[..., 0], x[..., 1]
     return torch.stack((cosine * a - sine * b, sine * a + cosine * b, x[..., 2].expand(angle.shape)), dim=-1)
+
+
+class ShrinkingSphere(OneLevelField):
+    """The sphere that mean curvature shrinks, |x| = √(r₀² − 4αt), as a distance or as a solution.
+
+    The distance f = |x| − √(r₀² − 4αt) obeys ∂f/∂t = α|∇f|κ on its surface only. ``exact_law=True`` gives the field
+    f = √(|x|² + 4αt) − r₀ with the same surface, which obeys it everywhere but is a distance at t = 0 only.
+
+    ``radius`` is r₀, ``alpha`` α (negative: it grows). ValueError if r₀ is not positive, or the sphere vanishes before
+    t = 1.
+    """
+
+    defined_by = ("radius", "alpha", "exact_law")
+
+    def __init__(self, *, radius: float = 0.8, alpha: float = 0.1, exact_law: bool = False) -> None:
+        super().__init__(in_dim=4)
+        if not (radius > 0 and radius**2 > 4 * alpha):
+            raise ValueError(f"radius={radius}, alpha={alpha}: expected radius > 0 and radius² > 4 alpha")
+        self.radius, self.alpha, self.exact_law = radius, alpha, exact_law
+
+    def radius_at(self, t: Tensor) -> Tensor:
+        """r(t) = √(r₀² − 4αt); NaN once the sphere is gone."""
+        return (self.radius**2 - 4 * self.alpha * t).sqrt()
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
+        return self.jet(x, level=level).value
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`."""
+        self.resolve_level(level)
+        position, time = self.check_points(x)[..., :3], x[..., 3]
+        if self.exact_law:
+            length = (position.square().sum(dim=-1) + 4 * self.alpha * time).sqrt()
+            value, rate = length - self.radius, 2 * self.alpha / length
+        else:
+            length, now = position.norm(dim=-1), self.radius_at(time)
+            value, rate = length - now, 2 * self.alpha / now
+        gradient = torch.cat((position / length[..., None], rate[..., None]), dim=-1)
+        return Jet(value, gradient, x.new_empty((*x.shape[:-1], 0)))

@@ -21,7 +21,7 @@ from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.reconstruct.consistency import GreyPictures
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
-from mplicits.pipelines.reconstruct.views import ViewImage, comparison_sheet, held_out, measure, render_image
+from mplicits.pipelines.reconstruct.views import ViewImage, comparison_sheet, held_out, measure, render_camera
 from mplicits.pipelines.render.picture import Image, contact_sheet, write_picture
 from mplicits.pipelines.surface.measure import Metrics, evaluate_surfaces
 from mplicits.pipelines.surface.surface import in_region, keep_largest
@@ -201,7 +201,7 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         model.requires_grad_(False)
         pairs: list[tuple[PosedImage, ViewImage]] = []
         for done, view in enumerate(tests, start=1):
-            pairs.append((view, render_image(model, view, similarity, objective.sampling, level=level)))
+            pairs.append((view, render_camera(model, view.camera.moved(similarity), objective.sampling, level=level)))
             report(Progress(f"{stage}: held-out views", done, len(tests), done / len(tests), {}))
         write_picture(context.picture("views"), comparison_sheet(pairs[:SHEET_VIEWS], model.background))
         mesh = self._mesh(model)

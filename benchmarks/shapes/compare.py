@@ -64,10 +64,10 @@ def draw(seen: Seen, colors: Tensor, *, samples: int = 1) -> Drawing:
         raise ValueError(f"samples={samples}: expected a divisor of both sides of a {width} × {height} image")
     light = torch.ones(height * width, 4)
     light[:, 3] = 0
-    light[seen.pixel.cpu(), :3] = srgb_to_linear(colors.detach().cpu().float().clamp(0, 1))
+    light[seen.pixel.cpu(), :3] = torch.from_numpy(srgb_to_linear(colors.detach().cpu().float().clamp(0, 1).numpy()))
     light[seen.pixel.cpu(), 3] = 1
     mean = light.reshape(height // samples, samples, width // samples, samples, 4).mean(dim=(1, 3))
-    return Drawing(linear_to_srgb(mean[..., :3].clamp(0, 1)).numpy(), mean[..., 3].numpy())
+    return Drawing(linear_to_srgb(mean[..., :3].clamp(0, 1).numpy()), mean[..., 3].numpy())
 
 
 def image_error(pairs: Iterable[tuple[Drawing, Drawing]]) -> ImageError:

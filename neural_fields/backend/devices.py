@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -171,8 +172,6 @@ LEAST_BLOCKS = 4  # for threads; with fewer, waking them costs more than it save
 
 
 split_operations = ContextVar("split_operations", default=False)  # blocks in turn, operations split among all threads
-_pool: ThreadPoolExecutor | None = None
-_pool_lock = threading.Lock()
 
 
 def over_blocks(rows: int, size: int, prepare: Callable[[int], Step], *, like: Tensor) -> None:
@@ -194,51 +193,38 @@ def over_blocks(rows: int, size: int, prepare: Callable[[int], Step], *, like: T
         for start in range(0, rows, size):
             step(slice(start, min(start + size, rows)))
         return
-    blocks, inference = _Blocks(rows, size), torch.is_inference_mode_enabled()
+    starts, lock, inference = iter(range(0, rows, size)), threading.Lock(), torch.is_inference_mode_enabled()
+
+    def work() -> None:
+        """Process blocks until none is left; after an error no thread begins another."""
+        step: Step | None = None
+        while True:
+            with lock:
+                start = next(starts, None)
+            if start is None:
+                return
+            try:
+                step = step or prepare(min(size, rows))
+                step(slice(start, min(start + size, rows)))
+            except BaseException:
+                with lock:
+                    deque(starts, maxlen=0)
+                raise
 
     def helper() -> None:
         torch.set_num_threads(1)
         with torch.inference_mode(inference), torch.no_grad():
-            blocks.work(prepare)
+            work()
 
     with one_thread():
         helpers = [_helpers().submit(helper) for _ in range(threads - 1)]
         try:
-            blocks.work(prepare)
+            work()
         finally:
             # Helpers that have not begun are cancelled, so this waits only for the blocks under way.
             failures = [error for one in helpers if not one.cancel() and (error := one.exception()) is not None]
     if failures:
         raise failures[0]
-
-
-class _Blocks:
-    """Slices of the rows; each goes to one thread, once."""
-
-    def __init__(self, rows: int, size: int) -> None:
-        self._starts = iter(range(0, rows, size))
-        self._rows, self._size = rows, size
-        self._lock = threading.Lock()
-
-    def __iter__(self) -> Iterator[slice]:
-        while True:
-            with self._lock:
-                start = next(self._starts, None)
-            if start is None:
-                return
-            yield slice(start, min(start + self._size, self._rows))
-
-    def work(self, prepare: Callable[[int], Step]) -> None:
-        """Process blocks until none is left; after an error no thread begins another."""
-        step: Step | None = None
-        try:
-            for block in self:
-                step = step or prepare(min(self._size, self._rows))
-                step(block)
-        except BaseException:
-            with self._lock:
-                self._starts = iter(())
-            raise
 
 
 def _may_share(like: Tensor) -> bool:
@@ -268,22 +254,14 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+@functools.cache
 def _helpers() -> ThreadPoolExecutor:
     """The threads beside the caller's; made at first use, and again in a forked process."""
-    global _pool
-    with _pool_lock:
-        if _pool is None:
-            _pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1), thread_name_prefix="mplicits")
-        return _pool
-
-
-def _after_fork() -> None:
-    global _pool, _pool_lock
-    _pool, _pool_lock = None, threading.Lock()
+    return ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1), thread_name_prefix="mplicits")
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
+    os.register_at_fork(after_in_child=_helpers.cache_clear)
 
 
 # Linux keeps the high-water mark of a process here. Not getrusage: its maximum survives exec, so that a child would
@@ -333,11 +311,11 @@ def peak_memory() -> int | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def choose_device(name: str, *, option: str = "--device") -> torch.device:
+def choose_device(name: str) -> torch.device:
     """The device of this name; ``auto`` is CUDA where there is a working GPU, the CPU elsewhere.
 
     Raises:
-        InputError: no such device here; the message names the ``option``.
+        InputError: no such device here.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -346,5 +324,5 @@ def choose_device(name: str, *, option: str = "--device") -> torch.device:
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"{option} {name}: not usable here ({reason}); use auto or cpu") from error
+        raise InputError(f"--device {name}: not usable here ({reason}); use auto or cpu") from error
     return device

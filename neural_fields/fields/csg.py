@@ -186,26 +186,14 @@ class _Boolean(_Pointwise):
         # Each blend lowers the minimum by at most smooth / 4; beyond that much more, one part alone decides the sign.
         return delta + (len(self.parts) - 1) * self.smooth / 4
 
-    def _blend(self, values: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
-        """The joined value, and for each part but the first the derivative of the blend by what came before."""
-        sign, signs = self._signs()
-        lowest, *others = (own * value for own, value in zip(signs, values, strict=True))
-        shares = []
-        for other in others:
-            lowest, share = _smooth_minimum(lowest, other, self.smooth)
-            shares.append(share)
-        return sign * lowest, shares
-
-    def _join(self, x: Tensor, values: list[Tensor]) -> Tensor:
-        return self._blend(values)[0]
-
     def _weigh(self, values: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
         sign, signs = self._signs()
-        value, shares = self._blend(values)
-        weights = [torch.ones_like(value)]
-        for share in shares:
+        lowest, *others = (own * value for own, value in zip(signs, values, strict=True))
+        weights = [torch.ones_like(lowest)]
+        for other in others:
+            lowest, share = _smooth_minimum(lowest, other, self.smooth)
             weights = [*(weight * share for weight in weights), 1 - share]
-        return value, [sign * own * weight for own, weight in zip(signs, weights, strict=True)]
+        return sign * lowest, [sign * own * weight for own, weight in zip(signs, weights, strict=True)]
 
 
 def _smooth_minimum(a: Tensor, b: Tensor, width: float) -> tuple[Tensor, Tensor]:

@@ -75,6 +75,8 @@ class Field(nn.Module, ABC):
         super().__init__()
         if not hasattr(type(self), "deltas"):  # a wrapper has those of the field that it wraps
             self.register_buffer("deltas", torch.empty(0), persistent=False)
+        self.register_state_dict_post_hook(_keep_definition)
+        self.register_load_state_dict_pre_hook(_check_definition)
 
     @abstractmethod
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
@@ -214,33 +216,22 @@ class Field(nn.Module, ABC):
             raise ValueError(f"x has shape {tuple(x.shape)}; expected (..., {self.in_dim})")
         return x
 
-    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
-        """Keep the definition in the state dict's metadata, in types that ``weights_only=True`` loads."""
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-        destination._metadata[prefix[:-1]]["definition"] = plain(self.definition())
 
-    def _load_from_state_dict(
-        self,
-        state_dict: Any,
-        prefix: str,
-        local_metadata: Any,
-        strict: bool,
-        missing_keys: Any,
-        unexpected_keys: Any,
-        error_msgs: Any,
-    ) -> None:
-        """Refuse tensors of another function than this one; a dict without metadata is not checked."""
-        here = plain(self.definition())
-        there = local_metadata.get("definition", here)
-        error_msgs += [
-            f"{prefix}{name} is {there.get(name)!r} where the tensors come from and {here.get(name)!r} here: "
-            "the same tensors would be another function"
-            for name in sorted({*here, *there})
-            if here.get(name) != there.get(name)
-        ]
-        super()._load_from_state_dict(
-            state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
-        )
+def _keep_definition(field: Field, _state: object, _prefix: str, metadata: dict[str, Any]) -> None:
+    """Keep the definition in the state dict's metadata, in types that ``weights_only=True`` loads."""
+    metadata["definition"] = plain(field.definition())
+
+
+def _check_definition(field: Field, _state: object, prefix: str, metadata: Mapping[str, Any], *others: Any) -> None:
+    """Refuse tensors of another function than this one; a dict without metadata is not checked."""
+    here = plain(field.definition())
+    there, errors = metadata.get("definition", here), others[-1]
+    errors += [
+        f"{prefix}{name} is {there.get(name)!r} where the tensors come from and {here.get(name)!r} here: "
+        "the same tensors would be another function"
+        for name in sorted({*here, *there})
+        if here.get(name) != there.get(name)
+    ]
 
 
 def plain(value: Any) -> Any:

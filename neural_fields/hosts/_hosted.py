@@ -27,13 +27,7 @@ Box = Tensor | Sequence[Sequence[float]]
 class Hosted(nn.Module):
     """A field f in a host's units: f(s x) / s, whose gradient is ∇f(s x). ValueError if a number is not positive.
 
-    Args:
-        field: signed distance, negative inside.
-        scale: s; by default 1, or with ``bounds`` what brings their farthest corner onto the field's unit sphere.
-        bounds: lowest and highest corner of what the host samples and meshes, in its units ``(2, 3)``.
-        half: half-edge of the box, in the host's units, where there are no ``bounds``.
-        learning_rate: see `rescale_parameters`; None leaves the parameters in their own units.
-        pace: share of the rates that suit the field; see `Pace`.
+    Arguments are those of `NeuSGeometry`; ``half`` is the half-edge of the box where there are no ``bounds``.
     """
 
     def __init__(
@@ -47,7 +41,7 @@ class Hosted(nn.Module):
         pace: Pace,
     ) -> None:
         super().__init__()
-        box = _cube(half) if bounds is None else as_bounds(bounds)
+        box = ((-half, -half, -half), (half, half, half)) if bounds is None else as_bounds(bounds)
         if scale is None:
             corner = (max(abs(low), abs(high)) for low, high in zip(*box, strict=True))
             scale = 1.0 if bounds is None else 1 / math.hypot(*corner)
@@ -133,11 +127,6 @@ def as_bounds(box: Box) -> Bounds:
         raise ValueError(f"bounds={corners.tolist()}: expected the lowest and the highest corner of a box, (2, 3)")
     low, high = corners.tolist()
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])
-
-
-def _cube(half: float) -> Bounds:
-    """The box from −half to half on each axis."""
-    return (-half, -half, -half), (half, half, half)
 
 
 def joined(jet: Jet) -> Tensor:

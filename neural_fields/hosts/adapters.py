@@ -269,15 +269,16 @@ class NerfstudioField(Hosted):
         frustums = ray_samples.frustums
         points = frustums.get_start_positions()
         jet = self._jet(points)
-        sdf = jet.value[..., None]
+        sdf, heads = jet.value[..., None], self.heads
         outputs = {
-            self.heads.RGB: self.color(points, frustums.directions, jet),
-            self.heads.SDF: sdf,
-            self._normal_head(): nn.functional.normalize(jet.gradient, dim=-1),
-            self.heads.GRADIENT: jet.gradient,
+            heads.RGB: self.color(points, frustums.directions, jet),
+            heads.SDF: sdf,
+            # Of nerfstudio, and of sdfstudio.
+            heads.NORMALS if hasattr(heads, "NORMALS") else heads.NORMAL: nn.functional.normalize(jet.gradient, dim=-1),
+            heads.GRADIENT: jet.gradient,
         }
         if return_alphas:
-            outputs[self.heads.ALPHA] = self.get_alpha(ray_samples, sdf, jet.gradient)
+            outputs[heads.ALPHA] = self.get_alpha(ray_samples, sdf, jet.gradient)
         return outputs
 
     def forward(
@@ -299,10 +300,6 @@ class NerfstudioField(Hosted):
         """See `Hosted.parameter_groups`; colours and deviation have ``lr`` itself."""
         others = [*self.color.parameters(), *self.deviation_network.parameters()]
         return [*super().parameter_groups(lr), {"params": others, "lr": lr}]
-
-    def _normal_head(self) -> Any:
-        """The host's key of normals: NORMALS in nerfstudio, NORMAL in sdfstudio."""
-        return self.heads.NORMALS if hasattr(self.heads, "NORMALS") else self.heads.NORMAL
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
         jet = self._jet(x)

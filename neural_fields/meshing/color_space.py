@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 Floats = TypeVar("Floats", NDArray[np.float32], NDArray[np.float64])
 
@@ -15,28 +13,16 @@ Floats = TypeVar("Floats", NDArray[np.float32], NDArray[np.float64])
 KNEE_DISPLAY, KNEE_LINEAR = 0.04045, 0.0031308
 
 
-@overload
-def srgb_to_linear(x: Tensor) -> Tensor: ...
-@overload
-def srgb_to_linear(x: Floats) -> Floats: ...
-def srgb_to_linear(x: Any) -> Any:
+def srgb_to_linear(x: Floats) -> Floats:
     """Display numbers in [0, 1] → linear light: ``x / 12.92`` up to 0.04045, else ``((x + 0.055) / 1.055)^2.4``.
 
     Linear light is what may be averaged: half of the light of white is 0.735 on the display, not 0.5.
     """
-    if isinstance(x, Tensor):
-        return torch.where(x <= KNEE_DISPLAY, x / 12.92, ((x.clamp(min=KNEE_DISPLAY) + 0.055) / 1.055) ** 2.4)
-    curve = ((np.maximum(x, KNEE_DISPLAY) + 0.055) / 1.055) ** 2.4
-    return np.where(x <= KNEE_DISPLAY, x / 12.92, curve)
+    light: Any = np.where(x <= KNEE_DISPLAY, x / 12.92, ((np.maximum(x, KNEE_DISPLAY) + 0.055) / 1.055) ** 2.4)
+    return light
 
 
-@overload
-def linear_to_srgb(x: Tensor) -> Tensor: ...
-@overload
-def linear_to_srgb(x: Floats) -> Floats: ...
-def linear_to_srgb(x: Any) -> Any:
+def linear_to_srgb(x: Floats) -> Floats:
     """Linear light in [0, 1] → display numbers; the inverse of `srgb_to_linear`."""
-    if isinstance(x, Tensor):
-        return torch.where(x <= KNEE_LINEAR, x * 12.92, 1.055 * x.clamp(min=KNEE_LINEAR) ** (1 / 2.4) - 0.055)
-    curve = 1.055 * np.maximum(x, KNEE_LINEAR) ** (1 / 2.4) - 0.055
-    return np.where(x <= KNEE_LINEAR, x * 12.92, curve)
+    display: Any = np.where(x <= KNEE_LINEAR, x * 12.92, 1.055 * np.maximum(x, KNEE_LINEAR) ** (1 / 2.4) - 0.055)
+    return display

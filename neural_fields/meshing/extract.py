@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -105,7 +104,6 @@ def extract_surface(
     given: Given | None = None,
 ) -> tuple[Mesh, ActiveCells, Ints]:
     """The mesh in the box of a sampler, its cells, and for each vertex the rows ``(V, 2)`` of the ends of its edge."""
-    times = [time.perf_counter()]
     try:
         along = 32 if given is None else 8
         blocks, centres, kept = cull_blocks(sampler, level=level, lipschitz=lipschitz, along=along)
@@ -113,14 +111,13 @@ def extract_surface(
         if given is None or not len(given.crossed):
             raise
         blocks, centres, kept = given.crossed[:0], given.values[:0], np.empty(0, bool)
-    times.append(time.perf_counter())
     cells = active_cells(sampler, blocks, centres, kept, level=level, lipschitz=lipschitz, given=given)
-    times.append(time.perf_counter())
     faces, ends = _triangles(cells)
-    fractions = _crossing(cells.values[ends[:, 0]], cells.values[ends[:, 1]]).clip(clearance, 1 - clearance)
+    below = cells.values[ends[:, 0]].astype(np.float64)
+    # Where the line through the values at both ends, of different signs, is zero.
+    fractions = (below / (below - cells.values[ends[:, 1]])).clip(clearance, 1 - clearance)
     start, step = cells.points[ends[:, 0]], cells.points[ends[:, 1]] - cells.points[ends[:, 0]]
     vertices = sampler.lattice.positions(start + fractions[:, None] * step)
-    times.append(time.perf_counter())
     unit = None
     if normals:
         rising = cells.values[ends[:, 1]] > cells.values[ends[:, 0]]
@@ -135,10 +132,7 @@ def extract_surface(
             fractions[moved] = stepped
             moved = moved[far]
             vertices = sampler.lattice.positions(start + fractions[:, None] * step)
-    times.append(time.perf_counter())
-    stages = ("cull", "corners", "triangles", "normals")
-    seconds = {stage: after - before for stage, before, after in zip(stages, times, times[1:], strict=False)}
-    stats = MeshStats(tuple(sampler.counts), int(kept.sum()), len(cells.cases), seconds)
+    stats = MeshStats(tuple(sampler.counts), int(kept.sum()), len(cells.cases))
     return Mesh(vertices, faces, unit, stats=stats), cells, ends
 
 
@@ -171,11 +165,6 @@ def map_normals(mesh: Mesh, field: FieldLike, *, level: int = -1, batch: int = 1
     points = torch.from_numpy(mesh.vertices).to(field.like)
     gradients = [field.jet(part, level=level).gradient for part in points.split(batch)]
     return replace(mesh, normals=normalize(torch.cat(gradients), dim=-1).float().cpu().numpy())
-
-
-def _crossing(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Where the line through values at 0 and 1, of different signs, is zero."""
-    return low.astype(np.float64) / (low.astype(np.float64) - high)
 
 
 def _newton(

@@ -34,7 +34,6 @@ class MeshStats:
     points: tuple[int, ...]  # sent to each level (a level may answer some by a coarser one)
     blocks: int  # surviving blocks of 2³ cells
     cells: int  # that the surface crosses
-    seconds: dict[str, float]  # wall time of each stage: "cull", "corners", "triangles", "normals"
 
 
 @dataclass(frozen=True)
@@ -292,16 +291,7 @@ def _write_ply(path: Path, mesh: Mesh, home: Similarity, placement: Placement) -
 
 
 def _write_stl(path: Path, mesh: Mesh, home: Similarity, placement: Placement) -> None:
-    mesh, _ = mesh.placed(".stl", home, placement)
-    corners = mesh.vertices[mesh.faces]  # (F, 3, 3)
-    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(facing, axis=1, keepdims=True)
-    faces = np.zeros(len(mesh.faces), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    faces["normal"] = np.divide(facing, length, out=np.zeros_like(facing), where=length > 0)
-    faces["corners"] = corners
-    with path.open("wb") as file:
-        file.write(b"mplicits".ljust(80) + len(faces).to_bytes(4, "little"))
-        file.write(faces.data)
+    mesh.placed(".stl", home, placement)[0].to_trimesh().export(path, file_type="stl")
 
 
 def _write_obj_mesh(path: Path, mesh: Mesh, home: Similarity, placement: Placement) -> None:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from ..backend.errors import at_least, positive
 from ..fields.field import Field, Jet, OneLevelField
 from .grids import HashEncoding
-from .siren import Siren, forward, needs_graph, plain_jet
+from .siren import Siren, block_rows, forward, needs_graph, plain_jet
 
 
 def encode(x: Tensor, frequencies: int) -> Tensor:
@@ -209,7 +209,8 @@ class ColorSiren(nn.Module):
         parameters = self.siren.folded()
         blocks = [rows]
         if not needs_graph(rows[0], [*rows[1:], *parameters]):
-            blocks = zip(*(part.split(self.siren.block_rows(part.device)) for part in rows), strict=True)
+            size = block_rows(self.siren.width, rows[0].device)
+            blocks = zip(*(part.split(size) for part in rows), strict=True)
         results = [evaluate(*block, parameters) for block in blocks]
         joined = [torch.cat(parts) for parts in zip(*results, strict=True)]
         return [whole.reshape(*points[0].shape[:-1], *whole.shape[1:]) for whole in joined]
@@ -279,7 +280,8 @@ class TextureField(OneLevelField):
         raw, slope = self.network.jet(rows[inside])
         value = self._background(rows).index_copy(0, inside, raw.clamp(0, 1))
         gradient = rows.new_zeros(len(rows), 3, self.in_dim)
-        gradient = gradient.index_copy(0, inside, slope * _unclamped(raw)[..., None])
+        free = ((raw >= 0) & (raw <= 1)).to(raw.dtype)  # the derivative of the clamp
+        gradient = gradient.index_copy(0, inside, slope * free[..., None])
         shape = (*x.shape[:-1], 3)
         return Jet(value.reshape(shape), gradient.reshape(*shape, self.in_dim), x.new_empty((*x.shape[:-1], 0)))
 
@@ -296,11 +298,6 @@ class TextureField(OneLevelField):
 
     def _background(self, rows: Tensor) -> Tensor:
         return self.outside.to(rows).expand(len(rows), 3)
-
-
-def _unclamped(raw: Tensor) -> Tensor:
-    """1 where clamping to [0, 1] changes nothing, 0 elsewhere: the derivative of the clamp."""
-    return ((raw >= 0) & (raw <= 1)).to(raw.dtype)
 
 
 def _tangent(x: Tensor, v: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:

@@ -135,12 +135,10 @@ class MultiscaleSDF(Field):
     @uncompiled
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; outside the band of level j − 1, level j is level j − 1."""
-        self.check_points(x)
-        if self._choose(x, level, jet=False).fused:
+        if self._choose(self.check_points(x), level, jet=False).fused:
             from ..backend.kernels.levels import levels_value
 
-            rows = self.check_points(x).reshape(-1, self.in_dim)
-            return levels_value(rows, as_levels(self, level), _mask()).reshape(x.shape[:-1])
+            return levels_value(x.reshape(-1, self.in_dim), as_levels(self, level), _mask()).reshape(x.shape[:-1])
         (f,) = deque(self._walk(x, level, _value), maxlen=1).pop()
         return f
 
@@ -158,12 +156,11 @@ class MultiscaleSDF(Field):
     @uncompiled
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; inside a tapered band ∇(γr) = γ∇r + r γ′ ∇f."""
-        self.check_points(x)
-        if self._choose(x, level, jet=True).fused:
+        if self._choose(self.check_points(x), level, jet=True).fused:
             from ..backend.kernels.levels import levels_jet
 
-            rows, shape = self.check_points(x).reshape(-1, self.in_dim), x.shape[:-1]
-            value, gradient = levels_jet(rows, as_levels(self, level), _mask())
+            shape = x.shape[:-1]
+            value, gradient = levels_jet(x.reshape(-1, self.in_dim), as_levels(self, level), _mask())
             return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
         return Jet(*deque(self._walk(x, level, lambda part, points: part.jet(points)), maxlen=1).pop())
 

@@ -159,7 +159,7 @@ class Siren(OneLevelField):
             buffers = [rows.new_empty(size, self.width) for _ in range(2)]
             return lambda part: _outputs_into(output[part], rows[part], parameters, buffers)
 
-        over_blocks(len(rows), self.block_rows(rows.device), prepare, like=rows)
+        over_blocks(len(rows), block_rows(self.width, rows.device), prepare, like=rows)
         return output
 
     @uncompiled
@@ -179,7 +179,7 @@ class Siren(OneLevelField):
             return _shaped(x, value[:, None], gradient)
         parameters = self.folded()
         if needs_graph(rows, parameters):
-            size = GRAPH_BLOCK_FACTOR * self.block_rows(rows.device)
+            size = GRAPH_BLOCK_FACTOR * block_rows(self.width, rows.device)
             parts = [_SirenJet.apply(part, *parameters) for part in rows.split(size)]
             output, gradient = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
         else:
@@ -190,7 +190,7 @@ class Siren(OneLevelField):
                 buffers = [rows.new_empty(size, self.width) for _ in range(self.depth + 2)]
                 return lambda part: _jet_into(output[part], gradient[part], rows[part], parameters, buffers)
 
-            over_blocks(len(rows), self.block_rows(rows.device), prepare, like=rows)
+            over_blocks(len(rows), block_rows(self.width, rows.device), prepare, like=rows)
         return _shaped(x, output, gradient)
 
     def _fused_jet(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -214,7 +214,7 @@ class Siren(OneLevelField):
         dims = self.resolve_dims(dims)
         rows = self.check_points(x).reshape(-1, self.in_dim)
         parameters = self.folded()
-        size = self.block_rows(rows.device) * (GRAPH_BLOCK_FACTOR if needs_graph(rows, parameters) else 1)
+        size = block_rows(self.width, rows.device) * (GRAPH_BLOCK_FACTOR if needs_graph(rows, parameters) else 1)
         parts = [_plain_second_jet(part, parameters, dims) for part in rows.split(size)]
         output, gradient, hessian = (torch.cat(part) for part in zip(*parts, strict=True))
         return SecondJet(*_shaped(x, output, gradient), hessian.reshape(*x.shape[:-1], dims, dims))
@@ -242,10 +242,6 @@ class Siren(OneLevelField):
             assert isinstance(layer, nn.Linear)
             yield layer
 
-    def block_rows(self, device: torch.device) -> int:
-        """Rows of one block on ``device``."""
-        return _block_rows(self.width, device)
-
 
 def _shaped(x: Tensor, output: Tensor, gradient: Tensor) -> Jet:
     """The jet at ``x`` ``(..., d)`` from outputs ``(N, 1 + F)`` and gradients ``(N, d)``."""
@@ -254,7 +250,8 @@ def _shaped(x: Tensor, output: Tensor, gradient: Tensor) -> Jet:
     return Jet(output[:, 0].reshape(shape), gradient.reshape(x.shape), features)
 
 
-def _block_rows(width: int, device: torch.device) -> int:
+def block_rows(width: int, device: torch.device) -> int:
+    """Rows of one block on ``device`` for networks of this width."""
     return max(256, (BLOCK_FLOATS if device.type == "cpu" else GPU_BLOCK_FLOATS) // width)
 
 
@@ -397,7 +394,7 @@ class _SirenJet(torch.autograd.Function):
                 torch.mul(g_rows[index + 1][part], cosines[index], out=s_rows[index])
                 torch.mm(s_rows[index], parameters[2 * index], out=g_rows[index][part])
 
-        over_blocks(len(x), _block_rows(width, x.device), lambda _: step, like=x)
+        over_blocks(len(x), block_rows(width, x.device), lambda _: step, like=x)
         ctx.save_for_backward(x, *parameters, *itertools.chain(*kept))
         return output, gradient
 
@@ -419,7 +416,7 @@ class _SirenJet(torch.autograd.Function):
         g_out = parameters[-2][:1].expand(len(x), -1)
         given = (output_bar, gradient_bar, x, *kept, g_out)
         x_bar = torch.empty_like(x) if ctx.needs_input_grad[0] else None
-        size = _block_rows(parameters[-2].shape[1], x.device)
+        size = block_rows(parameters[-2].shape[1], x.device)
         # Sums over points are made of 16 parts, in their order: the same bits for any number of threads.
         share = max(size, -(-len(x) // 16))
         starts = range(0, len(x), share)

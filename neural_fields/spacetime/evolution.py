@@ -137,7 +137,8 @@ def tangential_laplacian(jet: SpaceTimeJet, *, eps: float = 1e-12) -> Tensor:
     """``|∇f| κ = Δf − ⟨n, H n⟩`` with ``n = ∇f / |∇f|``: the trace of the Hessian in the tangent plane. ``(...,)``."""
     gradient, hessian = jet.gradient, jet.hessian
     normal_part = (gradient * (hessian @ gradient[..., None])[..., 0]).sum(dim=-1)
-    return _trace(hessian) - normal_part / (gradient.square().sum(dim=-1) + eps)
+    total = hessian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+    return total - normal_part / (gradient.square().sum(dim=-1) + eps)
 
 
 def curvature(jet: SpaceTimeJet, *, eps: float = 1e-12) -> Tensor:
@@ -182,10 +183,6 @@ def _tangential_determinant(jet: SpaceTimeJet, eps: float = 1e-12) -> Tensor:
     adjugate = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), dim=-2)
     gradient = jet.gradient
     return (gradient * (adjugate @ gradient[..., None])[..., 0]).sum(dim=-1) / (gradient.square().sum(dim=-1) + eps)
-
-
-def _trace(hessian: Tensor) -> Tensor:
-    return hessian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
 
 
 def _length(gradient: Tensor, eps: float = 1e-12) -> Tensor:

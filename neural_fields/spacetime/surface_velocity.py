@@ -22,24 +22,14 @@ from .field import at_time
 class CarriedVelocity:
     """V(x, t) on the moving surface of a four-dimensional field, for `flow`.
 
-    The motion as a whole is found at ``nodes`` ≥ 2 times from ``samples`` surface points, and interpolated; |∇f| counts
-    as at least ``least_slope``. Rigid motions are exact as far as normals show them: a turning sphere stays at rest.
+    The motion as a whole is found at ``nodes`` ≥ 2 times from 2048 surface points, and interpolated; |∇f| counts as at
+    least 0.1. Rigid motions are exact as far as normals show them: a turning sphere stays at rest.
     """
 
-    def __init__(
-        self,
-        field: Field,
-        *,
-        level: int = -1,
-        nodes: int = 17,
-        samples: int = 2048,
-        least_slope: float = 0.1,
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, field: Field, *, level: int = -1, nodes: int = 17) -> None:
         at_least(2, nodes=nodes)
-        self.field, self.level, self.least_slope = field, field.resolve_level(level), least_slope
-        generator = torch.Generator().manual_seed(seed)
-        points = ball_points(samples, radius=1.0, generator=generator)
+        self.field, self.level = field, field.resolve_level(level)
+        points = ball_points(2048, radius=1.0, generator=torch.Generator().manual_seed(0))
         parts = [self._whole(points.to(field.like), t) for t in torch.linspace(0, 1, nodes).tolist()]
         self.parts = torch.stack(parts)  # (nodes, 7)
 
@@ -54,7 +44,7 @@ class CarriedVelocity:
 
     def _normal_speed(self, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         gradient = self.field.jet(at_time(x, t), level=self.level).gradient
-        slope = gradient[..., :3].norm(dim=-1).clamp(min=self.least_slope)
+        slope = gradient[..., :3].norm(dim=-1).clamp(min=0.1)
         return gradient[..., :3] / slope[:, None], -gradient[..., 3] / slope
 
     @torch.no_grad()

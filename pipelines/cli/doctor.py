@@ -7,9 +7,7 @@ import importlib.util
 import os
 import platform
 import re
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -35,8 +33,8 @@ class Finding:
     text: str
 
 
-def examine(folder: Path | None = None) -> list[Finding]:
-    """Check Python, packages, threads, GPU, speed, and whether ``folder`` (the current directory) can be written."""
+def examine() -> list[Finding]:
+    """Check Python, packages, threads, GPU and speed."""
     # Not what developers need, nor the versions that a host has pinned, which `_cv2` judges.
     asked = [
         line for line in importlib.metadata.requires(PACKAGE) or [] if not re.search("extra == .dev|^[^;]*==", line)
@@ -50,7 +48,6 @@ def examine(folder: Path | None = None) -> list[Finding]:
         _cuda(),
         _kernels(),
         _speed(),
-        _disk(folder or Path()),
     ]
 
 
@@ -144,13 +141,3 @@ def _speed() -> Finding:
     if rate < 15:  # the two minutes of the default preset become more than ten
         return Finding("warning", "speed", f"{text}: slow, so start with --preset fast; is the machine busy?")
     return Finding("ok", "speed", text)
-
-
-def _disk(folder: Path) -> Finding:
-    try:
-        with tempfile.NamedTemporaryFile(dir=folder) as file:
-            file.write(bytes(1 << 20))
-            file.flush()
-    except OSError as error:
-        return Finding("error", "disk", f"cannot write to {folder.absolute()} ({error.strerror}); run elsewhere")
-    return Finding("ok", "disk", f"{folder.absolute()} can be written")

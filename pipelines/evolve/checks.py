@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,17 +19,6 @@ from .samples import band_points
 from .topology import Topology, find_changes, topology_of
 
 END_RESOLUTION = 192
-
-
-@dataclass(frozen=True)
-class FrameFigures:
-    """The surface at one time."""
-
-    time: float
-    volume: float  # inside it, in units of the field; 0 where there is no surface
-    components: int  # of it
-    holes: int  # through them
-    slope_error: float | None  # mean of ||∇f| − 1| at its vertices; None where there are none
 
 
 def check_evolution(
@@ -58,13 +46,13 @@ def check_evolution(
         count(frames + len(met), total)
     slopes = slope_figures(field)
     count(total - 1, total)
-    times, found = [frame.time for frame in shown], [Topology(frame.components, frame.holes) for frame in shown]
+    times, found = [frame["time"] for frame in shown], [Topology(each["components"], each["holes"]) for each in shown]
     changes = find_changes(field, times, found, resolution=resolution, until=until)
     count(total, total)
     checks = {
         "ends": met,
         "slopes": slopes,
-        "frames": [vars(frame) for frame in shown],
+        "frames": shown,
         "changes": [
             vars(change) | {"before": change.before._asdict(), "after": change.after._asdict()} for change in changes
         ],
@@ -143,11 +131,14 @@ def _loose_parts(checks: dict[str, Any]) -> list[str]:
     ]
 
 
-def frame_figures(field: Field, time: float, resolution: int) -> FrameFigures:
-    """Figures of the surface at a time, from a mesh of ``resolution`` cells along each side."""
-    still = TimeSlice(field, time)
+def frame_figures(field: Field, time: float, resolution: int) -> dict[str, Any]:
+    """Figures of the surface at a time, from a mesh of ``resolution`` cells along each side.
+
+    Its volume in units of the field, its topology, and the mean of ||∇f| − 1| at its vertices; 0 and None without any.
+    """
+    still, inside, error = TimeSlice(field, time), 0.0, None
     surface = surface_of(still, resolution=resolution)
-    if surface is None:
-        return FrameFigures(time, 0.0, 0, 0, None)
-    slope = value_and_gradient(still, torch.from_numpy(surface.vertices).float())[1].norm(dim=1)
-    return FrameFigures(time, volume(surface), *topology_of(surface), float((slope - 1).abs().mean()))
+    if surface is not None:
+        slope = value_and_gradient(still, torch.from_numpy(surface.vertices).float())[1].norm(dim=1)
+        inside, error = volume(surface), float((slope - 1).abs().mean())
+    return {"time": time, "volume": inside, **topology_of(surface)._asdict(), "slope_error": error}

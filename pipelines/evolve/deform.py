@@ -214,7 +214,8 @@ def carried_samples(
         t = first + (last - first) * torch.rand(each, generator=generator)
         begun = around(shape, each, seed + 31 + index, generator)
         begun = torch.cat((shape.points(each, seed + 57 + index), begun))
-        x = torch.cat([flow(carried.velocity, *part) for part in _parts(begun, keys[index], t.repeat(2))])
+        parts = zip(begun.split(MOTION.rows), t.repeat(2).split(MOTION.rows), strict=True)
+        x = torch.cat([flow(carried.velocity, part, keys[index], end) for part, end in parts])
         known.append(_on_surface(carried, at_time(x[:each], t)))
         sides.append(at_time(x[each:], t))
     anywhere = at_time(uniform(count // 2, generator), torch.rand(count // 2, generator=generator))
@@ -226,10 +227,6 @@ def carried_samples(
     zero = torch.zeros(len(positive))
     low, high = torch.where(positive, zero, -math.inf), torch.where(positive, math.inf, zero)
     return joined(known), Bounds(points[sure], low, high)
-
-
-def _parts(points: Tensor, start: float, end: Tensor) -> list[tuple[Tensor, float, Tensor]]:
-    return [(x, start, t) for x, t in zip(points.split(MOTION.rows), end.split(MOTION.rows), strict=True)]
 
 
 def _on_surface(carried: Field, points: Tensor) -> Known:

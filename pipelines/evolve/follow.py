@@ -25,10 +25,9 @@ FOLLOW = Solver(method="rk4", step=0.02)
 
 @dataclass(frozen=True, eq=False)
 class TrackedMesh:
-    """A mesh, and where its vertices are at some times."""
+    """A mesh, and where its vertices are at T times."""
 
     faces: NDArray[np.integer]  # (F, 3), the same at all times
-    times: tuple[float, ...]  # (T,)
     vertices: NDArray[np.float32]  # (T, V, 3)
     normals: NDArray[np.float32]  # (T, V, 3), of unit length
 
@@ -86,7 +85,7 @@ def follow_mesh(
         if progress is not None:
             progress(index, len(times) - 1)
     vertices, directions = (torch.stack(rows).float().cpu().numpy() for rows in (path, normals))
-    return TrackedMesh(mesh.faces, tuple(times), vertices, directions)
+    return TrackedMesh(mesh.faces, vertices, directions)
 
 
 def _lost(name: str, time: float, reason: str) -> InputError:

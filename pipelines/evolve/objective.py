@@ -88,7 +88,9 @@ class EvolveObjective(Objective):
         terms["eikonal"] = eikonal_loss(slopes).mean()
         total = total + config.eikonal_weight * terms["eikonal"]
         if self.law is not None and len(near):
-            terms["law"] = (self._interval(near[:, 3]).square() * law_loss(obeying, self.law)).mean()
+            keys = near.new_tensor(self.keys)
+            interval = keys.diff()[torch.bucketize(near[:, 3].contiguous(), keys[1:-1])]  # that each point lies in
+            terms["law"] = (interval.square() * law_loss(obeying, self.law)).mean()
             total = total + config.law_weight * terms["law"]
         if len(bounds):
             value = rest.value[len(known) : len(known) + len(bounds)]
@@ -96,11 +98,6 @@ class EvolveObjective(Objective):
             terms["bounds"] = outside.square().mean()
             total = total + config.bound_weight * terms["bounds"]
         return terms, total
-
-    def _interval(self, times: Tensor) -> Tensor:
-        """How long the interval between two keys is, at each of the times ``(N,)``."""
-        keys = times.new_tensor(self.keys)
-        return keys.diff()[torch.bucketize(times.contiguous(), keys[1:-1])]
 
     def _draw(self, size: int, count: int) -> Tensor:
         device = self.kept["pool"].device

@@ -159,7 +159,9 @@ class _Evolving(Training[EvolveConfig, SpaceTimeSDF]):
         """Begin one level, train it, freeze it."""
         config, started = self.config, time.monotonic()
         generator = torch.Generator().manual_seed(config.seed * 1009 + level)
-        delta = self.next_delta() if level else None
+        delta = None
+        if level:  # half-width of the band around the last frozen level (Eq. 5)
+            delta = max(delta_of(self.errors_at_ends(), epsilon=config.epsilon, quantile=None), config.least_delta)
         field = self.begun(level, delta, generator)
         beginning_seconds = time.monotonic() - started
         try:
@@ -212,11 +214,6 @@ class _Evolving(Training[EvolveConfig, SpaceTimeSDF]):
         """Untrained levels, to be filled from a state."""
         sirens = [new_level(self.config, level, residual=False, in_dim=4) for level in range(levels)]
         return SpaceTimeSDF(MultiscaleSDF(sirens[0], sirens[1:], [1.0] * (levels - 1)))
-
-    def next_delta(self) -> float:
-        """Half-width of the band around the last frozen level (Eq. 5)."""
-        delta = delta_of(self.errors_at_ends(), epsilon=self.config.epsilon, quantile=None)
-        return max(delta, self.config.least_delta)
 
     @torch.no_grad()
     def errors_at_ends(self) -> Tensor:

@@ -50,7 +50,7 @@ def on_globe(crs: str, origin: tuple[float, float, float]) -> Stand:
     those of a system without an ellipsoid of its own count from the ellipsoid WGS 84.
 
     Raises:
-        InputError: pyproj is missing, it knows no such system, the system has degrees, or the origin is not in its area.
+        InputError: pyproj is missing or knows no such system, the system has degrees, or the origin is outside of it.
     """
     try:
         import pyproj

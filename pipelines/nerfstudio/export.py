@@ -22,8 +22,6 @@ from ..mesh.files import check_textured_path
 from ..reconstruct.views import visible_points
 from ..surface.surface import Support, visible_part
 
-__all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "visible_mesh"]
-
 Float64 = NDArray[np.float64]
 Move = tuple[Float64, float]  # (3, 4) and a scale: see `in_data_coordinates`
 
@@ -66,17 +64,10 @@ def export_mesh(
 ) -> Mesh:
     """Mesh the last checkpoint of a training, colour it and write it, in the coordinates of the data set.
 
+    Arguments are those of the command, see `main`; ``seen`` ignores masks.
+
     Returns:
         The mesh as written: with vertex colours, or with ``texture`` the decimated one below its images.
-
-    Args:
-        config: ``config.yml`` of the training.
-        path: the file; its extension chooses the format.
-        resolution: cells along the longest side of the scene box.
-        level: of detail.
-        seen: leave out what fewer than two of the photographs that were trained on see; masks are ignored.
-        texture: texels along each side of an image of colours and one of normals, for GLB and OBJ.
-        faces: triangles to keep below the texture.
 
     Raises:
         InputError: there is no such training, it is not one of ours, or the file cannot be written, which is found
@@ -115,9 +106,7 @@ def _textured(path: Path, mesh: Mesh, field: NerfstudioField, move: Move, size: 
     rotation = move[0][:, :3]
 
     def colors_at(points: Float64) -> NDArray[np.float32]:
-        x = torch.from_numpy(_moved(points, *move)).to(field.field.like)
-        with torch.no_grad():
-            return torch.cat([field.frontal_colors(part) for part in x.split(1 << 14)]).float().numpy()
+        return _colors(field, _moved(points, *move))
 
     def normals_at(points: Float64) -> NDArray[np.float64]:
         return normals_near(field.field, _moved(points, *move) * field.scale, level=level) @ rotation
@@ -127,11 +116,15 @@ def _textured(path: Path, mesh: Mesh, field: NerfstudioField, move: Move, size: 
 
 
 @torch.no_grad()
+def _colors(field: NerfstudioField, points: Float64) -> NDArray[np.float32]:
+    """Colours ``(N, 3)`` that surface points ``(N, 3)`` have when they are seen from the front."""
+    x = torch.from_numpy(points).to(field.field.like)
+    return torch.cat([field.frontal_colors(part) for part in x.split(1 << 14)]).float().cpu().numpy()
+
+
 def colored(mesh: Mesh, field: NerfstudioField) -> Mesh:
     """A mesh in nerfstudio's coordinates with the colours that the surface has when it is seen from the front."""
-    points = torch.from_numpy(mesh.vertices).to(field.field.like)
-    colors = torch.cat([field.frontal_colors(part) for part in points.split(1 << 14)])
-    return dataclasses.replace(mesh, colors=colors.float().cpu().numpy())
+    return dataclasses.replace(mesh, colors=_colors(field, mesh.vertices))
 
 
 def host_cameras(cameras: Any) -> list[Camera]:

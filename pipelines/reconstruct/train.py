@@ -42,7 +42,7 @@ from .views import (
     held_out,
     measure,
     reduced,
-    render_image,
+    render_camera,
     spread,
     visible_points,
 )
@@ -286,9 +286,8 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
     def _image(self, view: PosedImage, *, level: int | None = None) -> ViewImage:
         """A view as the levels up to ``level`` show it; None: those that are switched on by now."""
         objective, level = self.trainer.objective, self.level if level is None else level
-        image = render_image(
-            self.model, view, self.images.similarity, objective.sampling, level=level, sdf_grid=objective.grid
-        )
+        camera = view.camera.moved(self.similarity)
+        image = render_camera(self.model, camera, objective.sampling, level=level, sdf_grid=objective.grid)
         # The exposure of a view that is not trained on is unknown.
         return image if self.model.exposures is None else exposed_as(image, view, self.model.background)
 

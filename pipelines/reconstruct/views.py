@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 from ...datasets.cameras import Camera
 from ...datasets.files import unit_range
 from ...datasets.views.images import OBJECT, PosedImage, resample, shrink
-from ...neural_fields import Field, Mesh, Similarity, sphere_trace
+from ...neural_fields import Field, Mesh, sphere_trace
 from ...neural_fields.volume.render import Sampling
 from ..render.picture import Image, stacked
 from ..render.rasterise import mesh_view
@@ -35,13 +34,6 @@ class ViewImage:
     opacity: Float32  # (H, W)
 
 
-def render_image(
-    model: SceneModel, view: PosedImage, similarity: Similarity, sampling: Sampling, **options: Any
-) -> ViewImage:
-    """`render_camera` of a view whose camera is in world coordinates; ``options`` are its."""
-    return render_camera(model, view.camera.moved(similarity), sampling, **options)
-
-
 @torch.no_grad()
 def render_camera(
     model: SceneModel,
@@ -49,15 +41,11 @@ def render_camera(
     sampling: Sampling,
     *,
     level: int = -1,
-    early_stop_eps: float = 1e-4,
-    alpha_threshold: float = 1e-4,
     sdf_grid: Callable[[Tensor], Tensor] | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> ViewImage:
     """Volume-render the image of a camera in unit-sphere coordinates, a ray through the middle of each pixel.
 
-    ``early_stop_eps``, ``alpha_threshold`` and ``sdf_grid`` are those of `SceneModel.render`. ``progress`` is called
-    with (rays done, rays in all).
+    ``level`` and ``sdf_grid`` are those of `SceneModel.render`.
     """
     device = model.background.device
     eye, directions = camera.rays(device=device)
@@ -67,16 +55,10 @@ def render_camera(
     normal, opacity = torch.zeros_like(color), torch.zeros_like(color[:, 0])
     # Rays that pass the region of interest see the background, whose colour is known unless it is learnt.
     cast = torch.from_numpy(np.flatnonzero(meets_sphere(camera) | (model.outside is not None))).to(device)
-    done = 0
+    how = {"level": level, "early_stop_eps": 1e-4, "alpha_threshold": 1e-4, "sdf_grid": sdf_grid}
     for rows in cast.split(4096):
-        rendered = model.render(
-            origins[rows], directions[rows], sampling, level=level,
-            early_stop_eps=early_stop_eps, alpha_threshold=alpha_threshold, sdf_grid=sdf_grid,
-        )  # fmt: skip
+        rendered = model.render(origins[rows], directions[rows], sampling, **how)
         color[rows], normal[rows], opacity[rows] = rendered.color, rendered.normal, rendered.opacity
-        done += len(rows)
-        if progress:
-            progress(done, len(cast))
     shape = (camera.height, camera.width)
     return ViewImage(
         color.clamp(0, 1).reshape(*shape, 3).cpu().numpy(),

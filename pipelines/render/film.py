@@ -66,7 +66,8 @@ def _write_mp4(path: Path, frames: Iterator[Image], fps: float) -> None:
     matrix = ["-vf", "scale=out_color_matrix=bt709:out_range=tv", "-pix_fmt", "yuv420p", *BT709]
     # x264's constant rate factor 16: flat colours and thin lines stay clean, and files are still small.
     settings = ["-vcodec", "libx264", "-crf", "16", "-movflags", "+faststart"]
-    _encode(map(_even, frames), fps, [*matrix, *settings, path])
+    even = (np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in frames)
+    _encode(even, fps, [*matrix, *settings, path])
 
 
 def _write_gif(path: Path, frames: Iterator[Image], fps: float) -> None:
@@ -118,8 +119,3 @@ def _ffmpeg(arguments: Sequence[str | Path]) -> Iterator[IO[bytes]]:
             log.seek(0)
             reason = " ".join(log.read().decode(errors="replace").split())[:200]
             raise OSError(f"ffmpeg failed: {reason or code}")
-
-
-def _even(frame: Image) -> Image:
-    """The frame with its last row and column repeated where their number is odd."""
-    return np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")

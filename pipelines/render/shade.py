@@ -39,8 +39,6 @@ def soft_shadow(
     level: int = -1,
     softness: float = 0.15,
     offset: float = 4e-3,
-    bound: float = BOUNDING_RADIUS,
-    max_steps: int = 160,
 ) -> Tensor:
     """How much of a distant lamp each point sees, ``(P,)`` in [0, 1]; edges blur with the distance a shadow falls.
 
@@ -54,11 +52,8 @@ def soft_shadow(
     ones (f ≥ δ), the surface may be nearer by δ.
 
     ``points`` and unit ``normals`` are ``(P, 3)``, ``towards_light`` ``(3,)``. Rays start ``offset`` above the surface
-    of ``level`` and end at the radius ``bound``. Raises a ValueError for a number that is not positive.
+    of ``level``.
     """
-    for name, number in (("softness", softness), ("offset", offset), ("bound", bound), ("max_steps", max_steps)):
-        if not number > 0:
-            raise ValueError(f"{name}={number}: expected a number > 0")
     level = field.resolve_level(level)
     lamp = towards_light.to(points)
     slack = torch.cat((points.new_zeros(1), field.deltas[:level].to(points)))
@@ -66,11 +61,12 @@ def soft_shadow(
     height = normals @ lamp
     rows = (height > 0).nonzero()[:, 0]
     slope = height[rows].clamp(max=softness)
-    start = _lifted(field, points[rows], normals[rows], level=level, offset=offset)
-    left = ball_crossing(start, lamp.expand_as(start), bound)[1]
+    start, above = points[rows], normals[rows]
+    start = start + (offset - field.value(start, level=level)).clamp(min=0)[:, None] * above  # if it is not higher
+    left = ball_crossing(start, lamp.expand_as(start), BOUNDING_RADIUS)[1]
     t = torch.full_like(left, offset)
     least = torch.ones_like(left)
-    for _ in range(max_steps):
+    for _ in range(160):
         if not len(rows):
             break
         f = field.value(start + t[:, None] * lamp, level=level)
@@ -96,18 +92,10 @@ def ambient_occlusion(
 
     The mean of clamp((f(p + d n) − f(p)) / d, 0, 1) over ``samples`` distances d along the normal, up to ``reach``.
     """
-    if not reach > 0 or samples < 1:
-        raise ValueError(f"reach={reach}, samples={samples}: expected reach > 0 and samples ≥ 1")
     steps = reach * torch.arange(1, samples + 1, dtype=points.dtype, device=points.device) / samples
     here = field.value(points, level=level)
     above = field.value(points + steps[:, None, None] * normals, level=level)  # (S, P)
     return ((above - here) / steps[:, None]).clamp(0, 1).mean(0)
-
-
-def _lifted(field: Field, points: Tensor, normals: Tensor, *, level: int, offset: float) -> Tensor:
-    """Points moved along their normals to ``offset`` above the surface of ``level``, if they are not higher."""
-    height = field.value(points, level=level)
-    return points + (offset - height).clamp(min=0)[:, None] * normals
 
 
 def _light_through(u: Tensor) -> Tensor:
@@ -122,8 +110,6 @@ def level_set_curvature(field: Field, points: Tensor, *, level: int = -1, step: 
     With the unit gradient n, h = ``step`` and the axes eᵢ, 2 H = Σᵢ (nᵢ(p + h eᵢ) − nᵢ(p − h eᵢ)) / 2h. Convex is
     positive. The error grows with h² and with (rounding of n) / h.
     """
-    if not step > 0:
-        raise ValueError(f"step={step}: expected a number > 0")
     offsets = step * torch.eye(3).to(points)[:, None]  # (3, 1, 3)
     ahead, behind = (normalize(field.jet(points + o, level=level).gradient, dim=-1) for o in (offsets, -offsets))
     return (ahead - behind).diagonal(dim1=0, dim2=2).sum(-1) / (4 * step)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import re
 import time
@@ -339,17 +340,16 @@ def texture_run(
             geometry = moment(geometry, 0.0)  # colours are transported from there
         trained_level = chosen_level(geometry, file, level)
         cloud = read_colors(source, samples=config.samples, seed=config.seed, columns=config.columns)
-        fingerprint = _fingerprint(cloud, geometry)
+        assert cloud.colors is not None
+        weights = (tensor.detach().cpu().numpy() for _, tensor in sorted(geometry.state_dict().items()))
+        fingerprint = digest_of((cloud.points, cloud.colors, *weights))
         if before.get("fingerprint", fingerprint) != fingerprint:
             raise InputError(
                 f"{source}: not the colours, or {file} not the field, that the interrupted training began with; "
                 "resume with those, or leave out --resume"
             )
         about = {"config": dataclasses.asdict(config), "level": level, "fingerprint": fingerprint}
-
-        def keep(state: dict[str, Tensor]) -> None:
-            save_state(state_file, state, about)
-
+        keep = functools.partial(save_state, state_file, progress=about)
         budget = Budget(config.time_budget, started=started)
         training = _Texturing(geometry, cloud, config, similarity, trained_level, budget, progress or silent, keep)
         training.trainer_state = tensors
@@ -369,13 +369,6 @@ def _thinned(cloud: PointCloud, share: float, seed: int) -> PointCloud:
     """That share of the points, but at least `FEWEST_COLORED`, drawn by the seed."""
     count = min(len(cloud), max(int(share * len(cloud)), FEWEST_COLORED))
     return select(cloud, np.sort(np.random.default_rng(seed).permutation(len(cloud))[:count]))
-
-
-def _fingerprint(cloud: PointCloud, geometry: Field) -> str:
-    """A digest of points, colours and field."""
-    assert cloud.colors is not None
-    weights = (tensor.detach().cpu().numpy() for _, tensor in sorted(geometry.state_dict().items()))
-    return digest_of((cloud.points, cloud.colors, *weights))
 
 
 def texture_of(run: str | Path, geometry: Field) -> TextureField | None:

@@ -55,10 +55,6 @@ class TransportOptions:
 TRANSPORT = TransportOptions()
 
 
-def _solver(step: float) -> Solver:
-    return Solver(method="rk4", step=step)
-
-
 def start_colors(run: str | Path, field: Field) -> Colors | None:
     """The colours beside a run, of its ``field`` or, if that moves, of its surface at time 0; None without a texture.
 
@@ -129,7 +125,7 @@ class TransportedPoints:
         if motion is not None:
             return lambda points: torch.cat(
                 [
-                    flow(motion, part, time, to, solver=_solver(TRANSPORT.learned_step))
+                    flow(motion, part, time, to, solver=Solver("rk4", step=TRANSPORT.learned_step))
                     for part in points.split(TRANSPORT.rows)
                 ]
                 or [points]
@@ -139,7 +135,8 @@ class TransportedPoints:
             return lambda points: points  # there is nothing that could have come from anywhere
         vertices = torch.from_numpy(mesh.vertices).to(self._field.like)
         try:
-            displacement = flow(self._velocity, vertices, time, to, solver=_solver(TRANSPORT.step)) - vertices
+            solver = Solver("rk4", step=TRANSPORT.step)
+            displacement = flow(self._velocity, vertices, time, to, solver=solver) - vertices
         except IntegrationError as error:
             raise InputError(f"colours cannot be transported to time {time:.3g} ({error}); leave them out") from error
         interpolation = _Interpolation(mesh.vertices, displacement.double().cpu().numpy())

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, ProgressColumn, Task, TaskID, TaskProgressColumn, TextColumn
@@ -187,7 +186,15 @@ def tensorboard_log(directory: str | Path) -> Iterator[Report]:
     Raises:
         InputError: tensorboard is not installed, or the directory cannot be made.
     """
-    writer = _writer(Path(directory))
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise input_error("--tensorboard: needs tensorboard; pip install mplicits[tensorboard]") from error
+    try:
+        Path(directory).mkdir(parents=True, exist_ok=True)
+        writer = SummaryWriter(str(directory))
+    except OSError as error:
+        raise input_error(f"--tensorboard {directory}: cannot be written ({error.strerror or error})") from error
 
     def log(progress: Progress, /) -> None:
         for name, value in progress.losses.items():
@@ -197,18 +204,6 @@ def tensorboard_log(directory: str | Path) -> Iterator[Report]:
         yield log
     finally:
         writer.close()
-
-
-def _writer(directory: Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise input_error("--tensorboard: needs tensorboard; pip install mplicits[tensorboard]") from error
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        return SummaryWriter(str(directory))
-    except OSError as error:
-        raise input_error(f"--tensorboard {directory}: cannot be written ({error.strerror or error})") from error
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

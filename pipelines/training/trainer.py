@@ -115,16 +115,13 @@ class Muon(torch.optim.Optimizer):
 
     All directions of a matrix are learnt at one speed, so a SIREN needs half of Adam's steps (Jordan et al., "Muon",
     2024). `torch.optim.Muon` multiplies in bfloat16, which takes longer than the step itself on CPUs without it.
-
-    Args:
-        matrices: groups of them, ``(n, m)`` each.
-        momentum: of the gradient; one step of it is looked ahead (Nesterov).
-        iterations: of the polynomial that takes singular values to between 0.7 and 1.2.
+    The momentum is Nesterov's: one step of it is looked ahead. ``matrices`` are groups of them, ``(n, m)`` each.
     """
 
-    def __init__(self, matrices: list[dict[str, Any]], *, momentum: float = 0.9, iterations: int = 5) -> None:
+    momentum = 0.9
+
+    def __init__(self, matrices: list[dict[str, Any]]) -> None:
         super().__init__(matrices, {"lr": 0.0})
-        self.momentum, self.iterations = momentum, iterations
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -133,17 +130,17 @@ class Muon(torch.optim.Optimizer):
             for matrix in group["params"]:
                 mean = self.state[matrix].setdefault("momentum", torch.zeros_like(matrix))
                 mean.lerp_(matrix.grad, 1 - self.momentum)
-                matrix.sub_(orthogonal(matrix.grad.lerp(mean, self.momentum), self.iterations), alpha=group["lr"])
+                matrix.sub_(orthogonal(matrix.grad.lerp(mean, self.momentum)), alpha=group["lr"])
 
 
-def orthogonal(matrix: Tensor, iterations: int = 5) -> Tensor:
+def orthogonal(matrix: Tensor) -> Tensor:
     """About ``U Vᵀ`` of a matrix ``U S Vᵀ`` ``(n, m)``: odd polynomials take its singular values to 0.7 to 1.2.
 
     The coefficients are those of Jordan et al. (2024), for the steepest slope at 0.
     """
     first, third, fifth = 3.4445, -4.7750, 2.0315
     found = matrix / matrix.norm().clamp_min(torch.finfo(matrix.dtype).tiny)
-    for _ in range(iterations):
+    for _ in range(5):
         square = found @ found.T
         found = torch.addmm(found, torch.addmm(square, square, square, beta=third, alpha=fifth), found, beta=first)
     return found
@@ -187,9 +184,7 @@ class Trainer(Generic[O]):
         seconds: end the schedule after this long even if steps remain; None for no limit.
         clip: largest norm of the whole gradient; None for any.
         network_name: what the network is called in `state`.
-        betas: of Adam.
-        eps: of Adam.
-        amsgrad: second moments never fall.
+        adam: other options of `torch.optim.Adam`.
     """
 
     def __init__(
@@ -201,16 +196,14 @@ class Trainer(Generic[O]):
         seconds: float | None = None,
         clip: float | None = None,
         network_name: str = "network",
-        betas: tuple[float, float] = (0.9, 0.99),
-        eps: float = 1e-8,
-        amsgrad: bool = False,
+        **adam: Any,
     ) -> None:
         self.objective, self.stage, self.steps, self.seconds, self.clip = objective, stage, steps, seconds, clip
         self.trained = [parameter for group in objective.groups for parameter in group.parameters]
         groups = [{"params": list(group.parameters), "rate": group.rate} for group in objective.groups]
         matrices = [group for group, given in zip(groups, objective.groups, strict=True) if given.matrices]
         others = [group for group, given in zip(groups, objective.groups, strict=True) if not given.matrices]
-        self.adam = torch.optim.Adam(others, betas=betas, eps=eps, amsgrad=amsgrad, fused=True)
+        self.adam = torch.optim.Adam(others, fused=True, **{"betas": (0.9, 0.99), **adam})
         self.optimisers: dict[str, torch.optim.Optimizer] = {"adam": self.adam}  # by their names in `state`
         if matrices:
             self.optimisers["muon"] = Muon(matrices)

@@ -11,12 +11,12 @@ from mplicits.neural_fields.networks.encoded import EncodedField
 from mplicits.neural_fields.networks.grids import HashEncoding
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.neural_fields.networks.siren import Siren, forward
-from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
 from mplicits.neural_fields.tracing.sphere import Hits
 from torch import Tensor
 
-from benchmarks.motion.figures import DeformingField, Twisting
+from benchmarks.motion.figures import DeformingField, ShrinkingSphere, Twisting
 from benchmarks.peers import BaconSDF, BandLimited, BanfSDF, HashGridSDF
 
 

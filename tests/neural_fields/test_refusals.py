@@ -18,10 +18,12 @@ from mplicits.neural_fields.shape import in_one_frame
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
 from mplicits.neural_fields.spacetime.field import spacetime_jet
 from mplicits.neural_fields.spacetime.flow import Solver, trajectories
-from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.neural_fields.spacetime.surface_velocity import CarriedVelocity
 from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
 from mplicits.neural_fields.volume.render import Sampling
+
+from benchmarks.motion.figures import ShrinkingSphere
 
 BALL, NETWORK, FOUR = nf.Sphere(radius=0.5), nf.Siren(8, 1), FIELDS["moving"]()
 EYE, AHEAD = torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])

@@ -74,11 +74,6 @@ def multiprocessors(device: torch.device) -> int:
     return torch.cuda.get_device_properties(device).multi_processor_count
 
 
-def scratch_for(x: Tensor, programs: int, floats: int) -> Tensor:
-    """Uninitialised memory of ``floats`` numbers for each of ``programs`` programs."""
-    return torch.empty(programs * floats, dtype=torch.float32, device=x.device)
-
-
 def half_scratch(like: Tensor, numbers: int) -> Tensor:
     """Uninitialised memory for ``numbers`` float16 numbers, at least one."""
     return torch.empty(max(1, numbers), dtype=torch.float16, device=like.device)
@@ -101,18 +96,15 @@ def launch(
     *,
     warps: int = 4,
     stages: int = 2,
-    registers: int | None = None,
     **constants: Any,
 ) -> None:
     """Launch as many programs of a kernel as the device holds at a time, at most ``tiles`` ≥ 1.
 
     How many a multiprocessor holds follows from the registers and shared memory of the compiled kernel; the first
-    launch, which compiles it, has one for each. ``arguments`` maps the number of programs to the kernel's arguments,
-    ``registers`` limits those of a thread, so that more programs run at a time, and ``constants`` are compiled in.
+    launch, which compiles it, has one for each. ``arguments`` maps the number of programs to the kernel's arguments;
+    ``constants`` are compiled in.
     """
     options = {**constants, "num_warps": warps, "num_stages": stages}
-    if registers is not None and like.is_cuda:
-        options["maxnreg"] = registers
     if not like.is_cuda:
         programs = min(tiles, INTERPRETED_PROGRAMS)
         kernel[(programs,)](*arguments(programs), **options)

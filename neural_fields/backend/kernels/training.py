@@ -25,7 +25,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import Network, Tiling, on_device, program_count, scratch_for, tiling_of
+from .launch import Network, Tiling, on_device, program_count, tiling_of
 from .tensor_tiles import points_of, rows_of
 from .tiles import add_first, cosine, first_phase, jet_of_tile, planes, product_from, sine
 
@@ -62,7 +62,7 @@ def jet(x: Tensor, network: Network) -> tuple[Tensor, Tensor]:
                 network.parameters,
                 value,
                 gradient,
-                scratch_for(x, programs, kept * tiling.rows * tiling.stride(network.width)),
+                x.new_empty(programs * kept * tiling.rows * tiling.stride(network.width)),
                 len(x),
                 network.omega,
                 network.gain,
@@ -268,7 +268,7 @@ def jet_backward(x: Tensor, network: Network, value_bar: Tensor, gradient_bar: T
                 gradient_bar.contiguous(),
                 x_bar,
                 sums,
-                scratch_for(x, programs, kept),
+                x.new_empty(programs * kept),
                 len(x),
                 network.omega,
                 network.gain,

@@ -6,7 +6,6 @@ import struct
 import imageio.v3 as iio
 import numpy as np
 import pytest
-import torch
 from mplicits import datasets
 from mplicits.datasets import TexturedMesh, colors_at, linear_to_srgb, read_textured, sample_textured, srgb_to_linear
 from mplicits.datasets.textured.mesh import Paint, lookup, pack
@@ -37,25 +36,19 @@ def at(mesh, x, y):
     return colors_at(mesh, face, weights)
 
 
-@pytest.mark.parametrize("kind", [np.float32, np.float64, torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_color_space_has_its_known_values(kind):
     display = [0.0, 0.04045, 0.5, 188 / 255, 1.0]
     linear = [0.0, 0.0031308, 0.21404114, 0.50288646, 1.0]
-    make = torch.tensor if isinstance(kind, torch.dtype) else np.array
-    x, y = make(display, dtype=kind), make(linear, dtype=kind)
+    x, y = np.array(display, dtype=kind), np.array(linear, dtype=kind)
     np.testing.assert_allclose(srgb_to_linear(x), y, atol=2e-7)
     np.testing.assert_allclose(linear_to_srgb(y), x, atol=1e-6)
     assert srgb_to_linear(x).dtype == linear_to_srgb(x).dtype == kind
 
 
-def test_color_space_goes_there_and_back_and_has_gradients():
+def test_color_space_goes_there_and_back():
     x = np.linspace(0, 1, 1001)
     np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(x)), x, atol=1e-7)
-    for curve in (srgb_to_linear, linear_to_srgb):
-        t = torch.tensor([0.0, 0.001, 0.3, 1.0], dtype=torch.float64, requires_grad=True)
-        assert torch.autograd.gradcheck(curve, t[1:])
-        (gradient,) = torch.autograd.grad(curve(t).sum(), t)
-        assert torch.isfinite(gradient).all()
 
 
 def test_centres_of_texels_are_half_a_texel_in():

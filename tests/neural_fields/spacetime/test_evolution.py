@@ -8,8 +8,10 @@ from fields import SCREW, small_spacetime
 from mplicits.neural_fields import Box, FunctionField, Moving, Siren, Sphere, Torus, at_time
 from mplicits.neural_fields.spacetime import evolution
 from mplicits.neural_fields.spacetime.field import spacetime_jet
-from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from torch import Tensor
+
+from benchmarks.motion.figures import ShrinkingSphere
 
 
 def samples(count: int, *, least: float = 0.0) -> Tensor:

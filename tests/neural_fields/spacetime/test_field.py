@@ -5,8 +5,10 @@ import pytest
 import torch
 from bounds import assert_within, rounding, unit_roundoff
 from fields import FIELDS, SCREW, cube, small_multiscale, small_spacetime
-from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from torch import Tensor
+
+from benchmarks.motion.figures import ShrinkingSphere
 
 TRAVEL = nf.RigidMotion(velocity=(0.4, 0.2, 0.0), center=(-0.2, 0.0, 0.1), angle=2.0)
 

@@ -2,8 +2,9 @@ import pytest
 import torch
 from fields import SCREW
 from mplicits.neural_fields import Box, Moving, Sphere, Torus, flow
-from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.neural_fields.spacetime.surface_velocity import CarriedVelocity
+
+from benchmarks.motion.figures import ShrinkingSphere
 
 ON_BOX = Box(half_size=(0.4, 0.25, 0.3))
 

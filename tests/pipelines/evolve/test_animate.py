@@ -32,7 +32,7 @@ from mplicits.neural_fields import (
 from mplicits.neural_fields.checkpoint import save_texture
 from mplicits.neural_fields.networks.colors import ColorSiren
 from mplicits.neural_fields.spacetime.dynamic_tracing import moment
-from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.neural_fields.tracing.sphere import project_to_surface
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve import animate
@@ -44,6 +44,8 @@ from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.texture.spread import CELL
 from mplicits.pipelines.texture.transport import TransportedColors, borrowed_colors, texture_colors
 from mplicits.pipelines.training.folder import load_still
+
+from benchmarks.motion.figures import ShrinkingSphere
 
 RADIUS, DRIFT = 0.3, torch.tensor([0.5, 0.0, 0.0])
 START = torch.tensor([-0.25, 0.0, 0.0])

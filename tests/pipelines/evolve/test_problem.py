@@ -15,12 +15,13 @@ from mplicits.neural_fields import Box, InputError, Moving, RigidMotion, Similar
 from mplicits.neural_fields.checkpoint import save_field
 from mplicits.neural_fields.spacetime.field import spacetime_jet
 from mplicits.neural_fields.spacetime.flow import Solver, trajectories
-from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.evolve.objective import EvolveObjective
 from mplicits.pipelines.evolve.problem import Problem, between, build_problem, velocity_field
 from mplicits.pipelines.evolve.shapes import Placed, Placement, StaticShape, aligned, into_unit_sphere, read_shape
 from mplicits.pipelines.training.settings import EvolveConfig
+
+from benchmarks.motion.figures import ShrinkingSphere
 
 CONFIG = EvolveConfig(samples=2000)
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]

@@ -9,7 +9,6 @@ import pytest
 import torch
 from evolutions import BRIEF, QUICK, ball, fails, few_points, interrupt
 from mplicits.neural_fields import InputError, Moving, MultiscaleSDF, RigidMotion, Siren, Sphere, at_time, load_field
-from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve.checks import check_evolution, slope_figures
 from mplicits.pipelines.evolve.problem import End
@@ -17,6 +16,8 @@ from mplicits.pipelines.evolve.samples import band_points
 from mplicits.pipelines.evolve.train import evolve
 from mplicits.pipelines.training.settings import EvolveConfig, load_config, preset_names
 from mplicits.pipelines.training.trainer import Interrupted
+
+from benchmarks.motion.figures import ShrinkingSphere
 
 TRAVEL = RigidMotion(velocity=(0.4, 0.0, 0.0))
 FLAGS = (

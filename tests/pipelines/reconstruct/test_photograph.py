@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import PosedImages, write_transforms
-from mplicits.neural_fields import InputError, Similarity, Sphere, save_field
+from mplicits.neural_fields import InputError, Sphere, save_field
 from mplicits.neural_fields.networks.grids import ValueGrid
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.photograph import open_scene, photograph
 from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct
-from mplicits.pipelines.reconstruct.views import render_image
+from mplicits.pipelines.reconstruct.views import render_camera
 from mplicits.pipelines.render.draw import RenderOptions
 from mplicits.pipelines.training.trainer import Interrupted, Progress
 from reconstructions import TINY_SCENE, painted_sphere
@@ -37,7 +37,7 @@ def run(images: PosedImages, tmp_path_factory: pytest.TempPathFactory) -> Recons
 def test_a_held_out_view_is_seen_as_it_was_measured(run: Reconstruction, images: PosedImages, tmp_path: Path) -> None:
     grid = ValueGrid(8)
     grid.refresh(run.model.geometry)
-    seen = render_image(run.model, images.views[0], Similarity.identity(), Sampling(8, 4), sdf_grid=grid).color
+    seen = render_camera(run.model, images.views[0].camera, Sampling(8, 4), sdf_grid=grid).color
     scene = open_scene(run.directory)
     assert scene.model.outside is not None
     # s goes through a logarithm and back: a few roundings, which its exponential makes ten times as many.

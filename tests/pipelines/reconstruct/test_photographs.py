@@ -12,7 +12,7 @@ from mplicits.neural_fields.volume.render import Rendered, Sampling
 from mplicits.pipelines.reconstruct.model import Exposures, PoseCorrections, RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.objective import SceneObjective
 from mplicits.pipelines.reconstruct.train import reconstruct
-from mplicits.pipelines.reconstruct.views import ViewImage, exposed_as, measure, render_image
+from mplicits.pipelines.reconstruct.views import ViewImage, exposed_as, measure, render_camera
 from reconstructions import TINY_SCENE, exact_model, painted_sphere, small_reconstructions
 from torch import Tensor, nn
 
@@ -97,7 +97,7 @@ def test_a_run_says_what_it_found(images: PosedImages) -> None:
     assert not {"exposures", "poses"} & set(reconstruct(images, replace(TINY, exposure="off", cameras="given")).record)
     model = build_scene(TINY, has_masks=False, views=3)
     assert model.outside is not None
-    seen = render_image(model, images.views[0], Similarity.identity(), Sampling(4, 0))
+    seen = render_camera(model, images.views[0].camera, Sampling(4, 0))
     assert seen.color.shape == (16, 16, 3)
 
 
@@ -131,7 +131,7 @@ def test_cameras_astray_are_brought_back(images: PosedImages) -> None:
     wrong[1, 2], wrong[2, 2] = math.radians(2.0), -math.radians(2.0)
     views = []
     for view, turn in zip(images.views, wrong, strict=True):
-        seen = render_image(model, view, Similarity.identity(), Sampling(32, 16), alpha_threshold=0.0)
+        seen = render_camera(model, view.camera, Sampling(32, 16))
         pose, camera = view.camera.world_from_camera.clone(), view.camera
         spin = torch.linalg.matrix_exp(turn[2] * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
         pose[:3, :3] = spin.to(pose) @ pose[:3, :3]

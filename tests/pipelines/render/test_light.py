@@ -124,19 +124,11 @@ def test_a_corner_darkens_with_nearness_and_with_reach():
     assert last[0] < 0.2
 
 
-def test_no_points_are_no_work_and_bad_numbers_are_refused(device):
+def test_no_points_are_no_work(device):
     none = torch.empty(0, 3, device=device)
     field = Sphere().to(device)
     assert soft_shadow(field, none, none, UP).shape == ambient_occlusion(field, none, none).shape == (0,)
     assert level_set_curvature(field, none).shape == (0,)
-    points, normals = on_plane((0, 0))
-    for wrong in ({"softness": 0.0}, {"offset": -1.0}, {"max_steps": 0}):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            soft_shadow(Plane(), points, normals, UP, **wrong)
-    with pytest.raises(ValueError, match="reach"):
-        ambient_occlusion(Plane(), points, normals, reach=0)
-    with pytest.raises(ValueError, match="step"):
-        level_set_curvature(Plane(), points, step=0)
 
 
 def test_curvature_of_spheres_planes_and_a_torus(dtype):
