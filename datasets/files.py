@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import json
 import math
@@ -16,7 +15,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,10 +23,6 @@ from numpy.typing import NDArray
 
 from ..neural_fields import InputError
 from ..neural_fields.backend.files import damage
-
-P = TypeVar("P", bound="str | Path")
-A = ParamSpec("A")
-R = TypeVar("R")
 
 # An array of an archive may have MODEST bytes, or MOST_UNPACKED times those of the archive.
 MOST_UNPACKED, MODEST = 200, 256 << 20
@@ -86,25 +81,13 @@ class _Silence:
 _silence = _Silence()
 
 
-def reader(read: Callable[Concatenate[P, A], R]) -> Callable[Concatenate[P, A], R]:
-    """Decorate a function that reads the file of its first argument with `readable`."""
-
-    @functools.wraps(read)
-    def reading(path: P, *args: A.args, **kwargs: A.kwargs) -> R:
-        with readable(Path(path)):
-            return read(path, *args, **kwargs)
-
-    return reading
-
-
 def read_json(path: Path, *, missing: str = "check the path") -> Any:
     """The content of a JSON file in UTF-8; see `readable` for ``missing``."""
     with readable(path, missing=missing):
-        data = path.read_bytes()
-    try:
-        return json.loads(data.decode("utf-8-sig"))
-    except ValueError as error:  # both of JSON and of UTF-8
-        raise InputError(f"{path}: is not JSON ({error}); export it again") from error
+        try:
+            return json.loads(path.read_bytes().decode("utf-8-sig"))
+        except ValueError as error:  # both of JSON and of UTF-8
+            raise InputError(f"{path}: is not JSON ({error}); export it again") from error
 
 
 def decoded(data: bytes) -> str:

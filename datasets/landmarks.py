@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..neural_fields import InputError
 from ..neural_fields.backend.files import write_whole
-from .files import readable
+from .clouds.readers.tables import numbers
+from .files import decoded, readable
 
 Float64 = NDArray[np.float64]
 
@@ -22,22 +23,9 @@ def read_landmarks(path: str | Path) -> tuple[Float64, Float64]:
     """
     path = Path(path)
     with readable(path):
-        lines = path.read_text(encoding="utf-8").splitlines()
-    pairs = []
-    for number, line in enumerate(lines, start=1):
-        words = line.partition("#")[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            pair = [float(word) for word in words]
-        except ValueError:
-            pair = []
-        if len(pair) != 6 or not np.isfinite(pair).all():
-            raise InputError(f"{path}, line {number}: expected six numbers, x y z of one shape and x y z of the next")
-        pairs.append(pair)
-    if not pairs:
-        raise InputError(f"{path}: no landmarks; write six numbers in a line, x y z of one shape and x y z of the next")
-    both = np.array(pairs)
+        both = numbers(decoded(path.read_bytes()).replace(",", " "), path, first_line=1, what="line")
+    if both.shape[1] != 6 or not np.isfinite(both).all():
+        raise InputError(f"{path}: expected six finite numbers in a line, x y z of one shape and x y z of the next")
     return both[:, :3], both[:, 3:]
 
 

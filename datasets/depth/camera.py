@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...neural_fields import InputError
 from ..cameras import COEFFICIENTS, Camera, intrinsics, pinhole_intrinsics
-from ..files import decoded, finite_number, read_json, readable, reader
+from ..files import decoded, finite_number, read_json, readable
 
 Float64 = NDArray[np.float64]
 
@@ -88,7 +88,6 @@ class DepthCamera:
         return self.rays().numpy() * depth[..., None]
 
 
-@reader
 def read_intrinsics(path: str | Path, *, size: tuple[int, int] | None = None) -> DepthCamera:
     """Read the intrinsics of a depth camera.
 
@@ -107,15 +106,13 @@ def read_intrinsics(path: str | Path, *, size: tuple[int, int] | None = None) ->
     """
     path = Path(path)
     fix = "give --intrinsics FX FY CX CY in pixels"
-    if path.suffix.lower() == ".json":
-        content = read_json(path, missing=f"check the path, or {fix}")
-    else:
-        with readable(path, missing=f"check the path, or {fix}"):
-            text = decoded(path.read_bytes())
-        content = _from_text(text, path)
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: expected width, height, fx, fy, cx and cy, or a 3 × 3 matrix; or {fix}")
-    fields = _fields({} if size is None else {"width": size[0], "height": size[1]}, content, path)
+    advice = f"check the path, or {fix}"
+    with readable(path, missing=advice):
+        is_json = path.suffix.lower() == ".json"
+        content = read_json(path, missing=advice) if is_json else _from_text(decoded(path.read_bytes()), path)
+        if not isinstance(content, dict):
+            raise InputError(f"{path}: expected width, height, fx, fy, cx and cy, or a 3 × 3 matrix; or {fix}")
+        fields = _fields({} if size is None else {"width": size[0], "height": size[1]}, content, path)
     missing = [name for name in _FIELDS if fields.get(name) is None]
     if missing:
         add = "it" if len(missing) == 1 else "them"

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in
 from ..cameras import OPENGL, Camera
-from ..files import decoded, read_json, readable, reader
+from ..files import decoded, read_json, readable
 from ..views.images import read_shots
 from .camera import DepthCamera, read_intrinsics
 from .images import fit_color, read_color, read_depth
@@ -104,7 +104,6 @@ def read_frame(
     return RgbdFrame(values, camera, picture, pose, str(depth))
 
 
-@reader
 def read_poses(path: str | Path) -> list[PosedFrame]:
     """Read the poses of frames, camera to world in OpenCV's axes, in the order of the file.
 
@@ -121,12 +120,13 @@ def read_poses(path: str | Path) -> list[PosedFrame]:
         InputError: the file is none of these, or a pose in it is not rigid.
     """
     path = Path(path)
-    if path.is_dir():
+    with readable(path):
+        if not path.is_dir():
+            return _file_poses(path)
         files = files_in(path, (".txt", ".json"))
         if not files:
             raise InputError(f"{path}: {_EXPECTED}")
         return [(file.stem, pose, lens) for file in files for _, pose, lens in _file_poses(file)[:1]]
-    return _file_poses(path)
 
 
 _EXPECTED = "no poses in it; expected a trajectory.log, TUM's poses, a transforms.json, or a folder of 4 × 4 matrices"
@@ -135,8 +135,7 @@ _EXPECTED = "no poses in it; expected a trajectory.log, TUM's poses, a transform
 def _file_poses(path: Path) -> list[PosedFrame]:
     if path.suffix.lower() == ".json" or path.name == "metadata":
         return _json_poses(path)
-    with readable(path):
-        text = decoded(path.read_bytes())
+    text = decoded(path.read_bytes())
     w_first = re.search(r"\bq\w*w\b.*\bq\w*x\b", text, re.IGNORECASE) is not None  # in a comment on the columns
     text = re.sub(r"#.*", "", text).replace(",", " ")
     lines = [line.split() for line in text.splitlines() if line.strip()]

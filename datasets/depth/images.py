@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
-from ..files import DEPTH_SUFFIXES, numeric, read_arrays, read_image, read_rgb, readable, reader, to_bytes
+from ..files import DEPTH_SUFFIXES, numeric, read_arrays, read_image, read_rgb, readable, to_bytes
 
 Float64 = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -92,7 +92,6 @@ def _saturated(numbers: NDArray[Any]) -> NDArray[np.bool_]:
     return (numbers == 65535) | (numbers == np.iinfo(numbers.dtype).max)
 
 
-@reader
 def read_color(path: str | Path) -> Bytes:
     """A colour picture → ``(H, W, 3)`` uint8 display RGB; grey becomes RGB, and transparency is ignored."""
     path = Path(path)
@@ -100,7 +99,8 @@ def read_color(path: str | Path) -> Bytes:
         raise InputError(
             f"{path}: unknown extension {path.suffix!r}; colour pictures are read from {', '.join(COLOR_SUFFIXES)}"
         )
-    return to_bytes(read_rgb(path)[0])
+    with readable(path):
+        return to_bytes(read_rgb(path)[0])
 
 
 def fit_color(color: Bytes, size: tuple[int, int], *, source: str, resize: bool = False) -> Bytes:
