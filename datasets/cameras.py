@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..neural_fields import Similarity
+from ..neural_fields import InputError, Similarity
 
 Float64 = NDArray[np.float64]
 
@@ -27,6 +27,7 @@ UP_AXES: Mapping[str, tuple[float, float, float]] = MappingProxyType({"y": (0.0,
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's axes (x right, y up, z backward) to OpenCV's, and back
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of OpenCV's distortion, in its order
+OBLIQUE = 1e-3  # how far the axes of a pose in a file may be from orthogonal and of one length, as a share of it
 UNDISTORTION = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)  # OpenCV's own five steps leave 1e-3
 
 
@@ -232,6 +233,34 @@ class Camera:
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     """``(3, 3)``: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` in float64."""
     return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def rigid_pose(value: Any, named: str, *, scaled: bool = False) -> Float64:
+    """A pose ``(4, 4)`` of a file that has three or four rows of four numbers, with the nearest rotation.
+
+    Files have the digits of float32, or fewer. A camera that was lost has a pose of NaN: no number of the file's is
+    finite, or, if it may be ``scaled``, one is not. Then a common length of the axes, which moves no ray, is left out.
+    An InputError that begins with ``named`` is raised for anything else.
+    """
+    expected = "expected a rigid pose, three or four rows of four numbers"
+    try:
+        matrix = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{named}: {expected} ({error})") from error
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise InputError(f"{named}: shape {matrix.shape}; {expected}")
+    finite = np.isfinite(matrix[:3])
+    if not (finite.all() if scaled else finite.any()):
+        return np.full((4, 4), np.nan)
+    left, lengths, right = np.linalg.svd(np.where(finite, matrix[:3], 0)[:, :3])
+    unit = lengths[0] if scaled else 1.0
+    rigid = bool(unit) and np.abs(lengths - unit).max() <= OBLIQUE * unit and np.linalg.det(left @ right) > 0
+    if not (rigid and finite.all() and (scaled or (matrix[3:] == (0, 0, 0, 1)).all())):
+        numbers = matrix.round(4).tolist()
+        raise InputError(f"{named}: is singular, mirrored, oblique or not finite: {numbers}; {expected}")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = left @ right, matrix[:3, 3]
+    return pose
 
 
 def pinhole_intrinsics(fov: float, width: int, height: int) -> Tensor:

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in
-from ..cameras import OPENGL, Camera
+from ..cameras import OPENGL, Camera, rigid_pose
 from ..files import decoded, read_json, readable
 from ..views.images import read_shots
 from .camera import DepthCamera, read_intrinsics
@@ -156,7 +155,7 @@ def _file_poses(path: Path) -> list[PosedFrame]:
         matrices = [np.reshape(row, (-1, 4)) for row in rows]
     else:
         raise InputError(f"{path}: {len(rows)} lines of {sorted(set(widths))} numbers; {_EXPECTED}")
-    poses = [_rigid(pose, f"{path}: frame {index}") for index, pose in enumerate(matrices)]
+    poses = [rigid_pose(pose, f"{path}: frame {index}") for index, pose in enumerate(matrices)]
     return [(name, pose, None) for name, pose in zip(names, poses, strict=False)]
 
 
@@ -174,20 +173,20 @@ def _json_poses(path: Path) -> list[PosedFrame]:
     found: list[PosedFrame] = []
     if "t_00" in content:  # Polycam
         rows = [[content.get(f"t_{i}{j}") for j in range(4)] for i in range(3)]
-        found.append((path.stem, _rigid(rows, f"{path}: t_00", OPENGL), read_intrinsics(path)))
+        found.append((path.stem, rigid_pose(rows, f"{path}: t_00") @ OPENGL, read_intrinsics(path)))
     elif isinstance(content.get("poses"), list):  # Record3D; its lens is that of the pictures
         for index, pose in enumerate(content["poses"]):
             named = f"{path}: poses[{index}]"
             numbers = pose if isinstance(pose, list) and len(pose) == 7 else []
             if not all(isinstance(x, int | float) for x in numbers) or not numbers:
                 raise InputError(f"{named}: expected qx, qy, qz, qw, tx, ty, tz")
-            found.append((f"{index}", _rigid(_from_quaternion(numbers[4:], numbers[:4]), named, OPENGL), None))
+            found.append((f"{index}", rigid_pose(_from_quaternion(numbers[4:], numbers[:4]), named) @ OPENGL, None))
     else:  # Open3D: from world to camera, by columns
         for index, item in enumerate(content.get("parameters", [content])):
             extrinsic = item.get("extrinsic") if isinstance(item, dict) else None
             if not isinstance(extrinsic, list) or len(extrinsic) != 16:
                 raise InputError(f"{path}: {_EXPECTED}")
-            pose = _rigid(np.reshape(extrinsic, (4, 4)).T, f"{path}: parameters[{index}].extrinsic")
+            pose = rigid_pose(np.reshape(extrinsic, (4, 4)).T, f"{path}: parameters[{index}].extrinsic")
             found.append((None, np.asarray(np.linalg.inv(pose), np.float64), None))
     return found
 
@@ -200,25 +199,3 @@ def _from_quaternion(place: Sequence[float], quaternion: ArrayLike) -> Float64:
     else:
         pose[:3, :3] = np.nan
     return pose
-
-
-def _rigid(matrix: Any, named: str, axes: Float64 | None = None) -> Float64:
-    """A pose ``(4, 4)`` of ``(3, 4)`` or ``(4, 4)`` numbers: with the nearest rotation, if RᵀR is within 1e-3 of I.
-
-    All NaN if none of the first three rows' numbers is finite.
-    """
-    try:
-        pose = np.concatenate((np.asarray(matrix, np.float64), [[0, 0, 0, 1]]))[: max(4, len(matrix))]
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{named}: expected the numbers of a pose; {error}") from error
-    turn = pose[:3, :3]
-    if pose.shape == (4, 4) and not np.isfinite(pose[:3]).any():
-        return np.full((4, 4), np.nan)
-    finite = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
-    off = np.abs(turn.T @ turn - np.eye(3)).max() if finite else np.inf
-    if off > 1e-3 or np.linalg.det(turn) < 0 or bool((pose[3] != (0, 0, 0, 1)).any()):
-        raise InputError(f"{named}: {pose.round(4).tolist()}; expected a rigid pose, camera to world")
-    left, _, right = np.linalg.svd(turn)
-    rigid = pose.copy()
-    rigid[:3, :3] = left @ right
-    return rigid if axes is None else rigid @ axes

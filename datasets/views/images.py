@@ -152,7 +152,8 @@ def _posed(
     points, observations = (read_colmap_points(source) if source.is_dir() else None) or (None, None)
     maps = find_depth_maps(shots, depths)
     shots = [replace(shot, depth=path) for shot, path in zip(shots, maps, strict=True)]
-    whole = [shot.placed is not None and not _missing(shot) for shot in shots]
+    files = [[file for file in (shot.image, shot.mask, shot.depth) if file is not None] for shot in shots]
+    whole = [shot.placed is not None and all(map(Path.is_file, own)) for shot, own in zip(shots, files, strict=True)]
     if not allow_missing:
         _check_files([shot for shot in shots if shot.placed is not None])
     reading = _counted(source, shots, sum(whole), allow_missing=allow_missing)
@@ -171,10 +172,6 @@ def _posed(
     else:
         similarity, words = _find_region(views, points, source)
     return PosedImages(views, similarity, words, points, source, observations, reading)
-
-
-def _missing(shot: Shot) -> bool:
-    return any(file is not None and not file.is_file() for file in (shot.image, shot.mask, shot.depth))
 
 
 def _counted(source: Path, shots: Sequence[Shot], placed: int, *, allow_missing: bool) -> str:
@@ -217,7 +214,7 @@ def _check_files(shots: Sequence[Shot]) -> None:
 def _view(shot: Shot, width: int | None, depths: DepthSource) -> PosedImage:
     color, mask = read_rgb(shot.image)
     see_through = mask is not None  # then what is not object has no colour of its own
-    camera = _fitted(shot, color.shape[1], color.shape[0])
+    camera = shot.camera_for(shot.image, color.shape[1], color.shape[0])
     if shot.mask is not None:
         mask, see_through = read_mask(shot.mask), False
         if mask.shape != color.shape[:2]:
@@ -242,16 +239,6 @@ def _view(shot: Shot, width: int | None, depths: DepthSource) -> PosedImage:
         color, mask = to_bytes(color), None if share is None else to_bytes(share)
     depth = None if shot.depth is None else read_depth_map(shot.depth, shot, depths)
     return PosedImage(shot.name, pinhole, color, mask, depth)
-
-
-def _fitted(shot: Shot, width: int, height: int) -> Camera:
-    """The camera for the picture that is there: files often keep the size of the original photographs."""
-    camera = shot.camera
-    if not camera.fits(width, height):
-        sizes = f"{width} × {height} pixels, but its camera has {camera.width} × {camera.height}"
-        raise InputError(f"{shot.named}: {shot.image} has {sizes}; turn, crop or export it as it was")
-    same = (camera.width, camera.height) == (width, height)
-    return camera if same else camera.resized(width, height)
 
 
 def _find_region(

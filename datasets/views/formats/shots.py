@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -34,11 +33,14 @@ class Shot:
     depth: Path | None = None
     depth_scale: float | None = None  # steps per unit of an integer depth map, if the file gives it; see `read_depth`
 
-    @property
-    def camera(self) -> Camera:
-        """The camera of a photograph that has one."""
-        assert self.placed is not None, self.named
-        return self.placed
+    def camera_for(self, file: Path, width: int, height: int) -> Camera:
+        """Its camera for the picture or depth map ``file``: often the size is that of the original photographs."""
+        camera = self.placed
+        assert camera is not None, self.named
+        if not camera.fits(width, height):
+            sizes = f"{width} × {height} pixels, but its camera has {camera.width} × {camera.height}"
+            raise InputError(f"{self.named}: {file} has {sizes}; turn, crop or export it as the photograph was")
+        return camera.resized(width, height)
 
 
 @dataclass(frozen=True)
@@ -92,16 +94,15 @@ def find_depth_maps(shots: list[Shot], source: DepthSource) -> list[Path | None]
         return [shot.depth for shot in shots]
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; it should hold a depth map for each photograph")
-    found = [_first_file((folder / shot.name, folder / Path(shot.name).name), DEPTH_SUFFIXES) for shot in shots]
+    found: list[Path | None] = []
+    for shot in shots:
+        places = (folder / shot.name, folder / Path(shot.name).name)
+        files = (place.with_suffix(suffix) for place in places for suffix in DEPTH_SUFFIXES)
+        found.append(next((file for file in files if file.is_file()), None))
     if not any(found):
         first = f"{Path(shots[0].name).stem}.png, .tif, .npy or .npz for {shots[0].name}"
         raise InputError(f"{folder}: no depth map in it has the name of a photograph; expected {first}")
     return found
-
-
-def _first_file(places: Sequence[Path], suffixes: Sequence[str]) -> Path | None:
-    files = (place.with_suffix(suffix) for place in places for suffix in suffixes)
-    return next((file for file in files if file.is_file()), None)
 
 
 def read_depth_map(path: Path, shot: Shot, source: DepthSource) -> DepthMap:
@@ -111,11 +112,7 @@ def read_depth_map(path: Path, shot: Shot, source: DepthSource) -> DepthMap:
     """
     depth = read_depth(path, scale=source.scale, integer_scale=shot.depth_scale, saturates=source.kind == "metric")
     height, width = depth.shape
-    if not shot.camera.fits(width, height):
-        size = f"{shot.camera.width} × {shot.camera.height}"
-        sizes = f"{width} × {height} pixels, but the camera of {shot.name} has {size}"
-        raise InputError(f"{path}: {sizes}; export it in the view of the photograph (registered)")
-    camera = shot.camera.resized(width, height)
+    camera = shot.camera_for(path, width, height)
     if source.kind == "metric":
         edges = edge_pixels(depth, pixel_angle=1 / camera.fx_fy_cx_cy[0], jump=JUMP)
         depth = np.where(edges, np.nan, depth)

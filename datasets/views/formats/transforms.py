@@ -9,19 +9,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ....neural_fields import InputError
-from ...cameras import COEFFICIENTS, OPENGL, Camera, intrinsics
+from ...cameras import COEFFICIENTS, OPENGL, Camera, intrinsics, rigid_pose
 from ...files import finite_number, read_json
 from .shots import IMAGE_SUFFIXES, Shot, image_size
-
-Float64 = NDArray[np.float64]
 
 # Camera models of nerfstudio and COLMAP that are pinholes, once undistorted.
 LENSES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL")
 COMMON, DIVISOR = COEFFICIENTS[:5], COEFFICIENTS[5:]
-OBLIQUE = 1e-3  # how far the axes of a pose may be from orthogonal and of one length, as a share of their length
 
 
 @dataclass(frozen=True)
@@ -133,8 +129,8 @@ def _camera(frame: _Frame, image: Path) -> Camera | None:
     named = frame.named("transform_matrix")
     if "transform_matrix" not in frame.own:
         raise InputError(f"{named}: missing; add the pose of the camera, four rows of four numbers")
-    pose = _matrix(frame.own["transform_matrix"], named)
-    if pose is None:
+    value = frame.own["transform_matrix"]
+    if value is None or np.isnan(pose := rigid_pose(value, named, scaled=True)).any():
         return None
     matrix = intrinsics(fx, fx if fy is None else fy, cx - 0.5, cy - 0.5)
     return Camera(matrix, torch.from_numpy(pose @ OPENGL), width, height, _distortion(frame))
@@ -165,24 +161,3 @@ def _size(frame: _Frame, image: Path) -> tuple[int, int]:
         if value != int(value):
             raise InputError(f"{frame.named(key)}: {value:g}; expected whole pixels")
     return int(width), int(height)
-
-
-def _matrix(value: Any, named: str) -> Float64 | None:
-    """A rigid pose ``(4, 4)`` without the axes' common scale, which moves no ray; None if it is null or not finite."""
-    if value is None:
-        return None
-    try:
-        matrix = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{named}: expected four rows of four numbers") from error
-    if matrix.shape not in ((4, 4), (3, 4)):
-        raise InputError(f"{named}: shape {matrix.shape}; expected (4, 4)")
-    if not np.isfinite(matrix).all():
-        return None
-    left, lengths, right = np.linalg.svd(matrix[:3, :3])
-    axes = left @ right  # the nearest rotation: files have the digits of float32, or fewer
-    if lengths[2] < (1 - OBLIQUE) * lengths[0] or not lengths[0] or np.linalg.det(axes) < 0:
-        raise InputError(f"{named}: is singular, mirrored or oblique; expected a rotation and a place")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = axes, matrix[:3, 3]
-    return pose

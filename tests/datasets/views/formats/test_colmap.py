@@ -87,8 +87,8 @@ WRITERS = (write_text, write_binary)
 def test_every_model_gives_its_cameras_in_the_order_of_names(model, write, tmp_path):
     shots = read_colmap(write(tmp_path, model))
     assert [shot.name for shot in shots] == sorted(NAMES)
-    same_cameras([shot.camera for shot in shots], [cameras(model)[name] for name in sorted(NAMES)])
-    assert all(shot.camera.distortion == LENSES[model][1] for shot in shots)
+    same_cameras([shot.placed for shot in shots], [cameras(model)[name] for name in sorted(NAMES)])
+    assert all(shot.placed.distortion == LENSES[model][1] for shot in shots)
 
 
 @pytest.mark.parametrize("write", WRITERS)

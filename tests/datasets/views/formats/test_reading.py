@@ -123,7 +123,7 @@ def without(key: str) -> dict:
         (without("w"), r"frames\[0\]\.file_path: no image .*images/0\.png"),
         (without("transform_matrix"), r"frames\[1\]\.transform_matrix: missing"),
         (frame_change(transform_matrix=[[1, 0], [0, 1]]), r"frames\[1\]\.transform_matrix: shape \(2, 2\)"),
-        (frame_change(transform_matrix=[[1, 0], [0]]), r"frames\[1\]\.transform_matrix: expected four rows"),
+        (frame_change(transform_matrix=[[1, 0], [0]]), r"frames\[1\]\.transform_matrix: expected a rigid pose"),
         (frame_change(transform_matrix=np.zeros((4, 4)).tolist()), r"frames\[1\]\.transform_matrix: is singular"),
         (frame_change(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "transform_matrix: is singular, mirrored"),
         (frame_change(transform_matrix=np.diag([1, 1.1, 1, 1]).tolist()), "transform_matrix: .* oblique"),
