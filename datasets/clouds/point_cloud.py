@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -94,16 +94,15 @@ def unit_rows(vectors: NDArray[np.floating] | NDArray[np.integer]) -> NDArray[np
     return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0)
 
 
+def sums_by(owner: Int64, vectors: Float64, count: int = 0) -> Float64:
+    """Sums ``(count, 3)`` of the vectors ``(N, 3)`` of each owner, numbered from 0."""
+    return np.stack([np.bincount(owner, vectors[:, axis], count) for axis in range(3)], axis=1)
+
+
 def select(cloud: PointCloud, index: NDArray[np.integer] | NDArray[np.bool_]) -> PointCloud:
     """The cloud with only these points: indices ``(M,)`` or a mask ``(N,)``."""
-    return PointCloud(
-        cloud.points[index],
-        None if cloud.normals is None else cloud.normals[index],
-        None if cloud.colors is None else cloud.colors[index],
-        cloud.source,
-        cloud.normals_source,
-        cloud.reading,
-    )
+    normals, colors = (None if rows is None else rows[index] for rows in (cloud.normals, cloud.colors))
+    return replace(cloud, points=cloud.points[index], normals=normals, colors=colors)
 
 
 def thin(cloud: PointCloud, max_points: int) -> PointCloud:

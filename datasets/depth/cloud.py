@@ -254,7 +254,10 @@ class _Pool:
 
     def joined(self) -> tuple[PointCloud, Int32]:
         """All points, and the number of the frame of each."""
-        return _concatenated(self.clouds), np.concatenate(self.owners)
+        points, normals, colors = zip(*((each.points, each.normals, each.colors) for each in self.clouds), strict=True)
+        colors = np.concatenate(colors) if self.colored else None
+        cloud = PointCloud(np.concatenate(points), np.concatenate(normals), colors, self.source)
+        return cloud, np.concatenate(self.owners)
 
 
 def _other_frames(frames: int, limit: int) -> Int64:
@@ -267,20 +270,15 @@ def _votes(points: Float64, owner: Int32, others: Int64, tolerance: float, index
     """Votes of a frame, see `_verdict`, on the points ``(N, 3)`` of frames with it among their ``others``; else 0."""
     mine = np.flatnonzero((others == index).any(axis=1)[owner])
     votes = np.zeros(len(points), np.int64)
-    votes[mine] = _verdict(points[mine], frame, _nearest_around(frame.depth), tolerance)
+    votes[mine] = _verdict(points[mine], frame, tolerance)
     return votes
 
 
-def _nearest_around(depth: Float64) -> Float64:
-    """The nearest depth among a pixel and its eight neighbours ``(H, W)``; 0 where one of them has no reading.
-
-    With it, slanted surfaces and rims in front of a far background are not seen through.
-    """
-    return np.asarray(cv2.erode(np.nan_to_num(depth, nan=0.0), np.ones((3, 3), np.uint8)), np.float64)
-
-
-def _verdict(points: Float64, frame: RgbdFrame, nearest: Float64, tolerance: float) -> Int64:
+def _verdict(points: Float64, frame: RgbdFrame, tolerance: float) -> Int64:
     """For each point ``(N, 3)`` in world coordinates: 1 if the frame sees through it, −1 if it sees it, else 0."""
+    # The least among a pixel and its eight neighbours, or 0 where one has no reading: so slanted surfaces, and rims in
+    # front of a far background, are not seen through.
+    nearest = np.asarray(cv2.erode(np.nan_to_num(frame.depth, nan=0.0), np.ones((3, 3), np.uint8)), np.float64)
     pixels, depths, inside = frame.view.in_view(points)
     index = np.flatnonzero(inside)
     u, v = np.rint(pixels[index]).astype(np.int64).T
@@ -290,17 +288,6 @@ def _verdict(points: Float64, frame: RgbdFrame, nearest: Float64, tolerance: flo
     verdict[index] = (z < (1 - tolerance) * nearest[v, u]).astype(np.int64)
     verdict[index[np.abs(z - there) <= tolerance * there]] = -1
     return verdict
-
-
-def _concatenated(clouds: Sequence[PointCloud]) -> PointCloud:
-    normals = [cloud.normals for cloud in clouds if cloud.normals is not None]
-    colors = [cloud.colors for cloud in clouds if cloud.colors is not None]
-    return PointCloud(
-        np.concatenate([cloud.points for cloud in clouds]),
-        np.concatenate(normals),
-        np.concatenate(colors) if colors else None,
-        clouds[0].source,
-    )
 
 
 def _summed(reports: Sequence[DepthReport], *, kept: int, seen_through: int) -> DepthReport:

@@ -155,8 +155,7 @@ def add_outliers(cloud: PointCloud, fraction: float, *, seed: int = 0) -> PointC
 
 def _directions(random: np.random.Generator, count: int) -> Float64:
     """Unit vectors ``(count, 3)``, uniform on the sphere."""
-    vectors = random.normal(size=(count, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return unit_rows(random.normal(size=(count, 3)))
 
 
 def _occupied_cells(

@@ -32,8 +32,6 @@ def read_textured(path: str | Path) -> TexturedMesh:
         InputError: the file, a material or an image is missing or damaged, or there are no faces or no colours.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; check the path")
     reader = TEXTURED_READERS.get(path.suffix.lower())
     if reader is None:
         known = ", ".join(TEXTURED_READERS)
@@ -51,10 +49,9 @@ def sample_textured(mesh: TexturedMesh, count: int, *, seed: int) -> PointCloud:
     """``count`` points uniform by area, with the colours of the surface and the normals of their faces.
 
     Raises:
-        InputError: the faces have no area, or the mesh has no colours.
+        InputError: the faces have no area.
+        ValueError: the mesh has no colours.
     """
-    if not mesh.has_colors:
-        raise InputError(f"{mesh.source}: neither a texture nor vertex colours in it; export it with its colours")
     corners = mesh.vertices[mesh.faces]  # (F, 3, 3)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = np.linalg.norm(cross, axis=1)  # twice the area

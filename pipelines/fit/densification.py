@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...datasets.clouds.cleaning.winding import DipoleField
+from ...datasets.clouds.point_cloud import unit_rows
 from .cloud import CLOUD, CloudDistance
 
 Float64 = NDArray[np.float64]
@@ -194,7 +195,7 @@ class _Patches:
         bent = np.einsum("mkab,mkb->mka", self.shape[found], offset)
         own = self.normals[found]
         value = ((own + 0.5 * bent) * offset).sum(axis=2)
-        return distance, found, offset, value, _unit(own + bent)
+        return distance, found, offset, value, unit_rows(own + bent)
 
 
 def _fitted(
@@ -236,11 +237,11 @@ def _placed(patches: _Patches, parents: Rows, random: np.random.Generator) -> tu
     """New points and their normals, at most one beside each of ``parents``."""
     normal = patches.normals[parents]
     step = random.normal(size=(len(parents), 3))
-    step = _unit(step - (step * normal).sum(axis=1, keepdims=True) * normal)
+    step = unit_rows(step - (step * normal).sum(axis=1, keepdims=True) * normal)
     step *= (0.8 * patches.reach[parents] * np.sqrt(random.random(len(parents))))[:, None]
     bent = np.einsum("mab,mb->ma", patches.shape[parents], step)
     x = patches.points[parents] + step - 0.5 * (bent * step).sum(axis=1, keepdims=True) * normal
-    normal, good = _unit(normal + bent), np.ones(len(parents), bool)
+    normal, good = unit_rows(normal + bent), np.ones(len(parents), bool)
     for _ in range(2):  # patches are flat across a spacing: the second move is a hundredth of the first
         moved, normal, good = _blended(patches, x, normal)
         x = x + moved
@@ -261,7 +262,7 @@ def _blended(patches: _Patches, x: Float64, normal: Float64) -> tuple[Float64, F
     total = weight.sum(axis=1, keepdims=True)
     weight /= np.maximum(total, 1e-300)
     mean = (weight * value).sum(axis=1, keepdims=True)
-    blend = _unit((weight[..., None] * theirs).sum(axis=1))
+    blend = unit_rows((weight[..., None] * theirs).sum(axis=1))
     spread = np.sqrt((weight * (value - mean) ** 2).sum(axis=1, keepdims=True))
     # Two points of one surface are on the same side of each other's planes, on arcs and edges alike.
     above, below = -(offset * blend[:, None]).sum(axis=2), (offset * patches.normals[found]).sum(axis=2)
@@ -271,7 +272,3 @@ def _blended(patches: _Patches, x: Float64, normal: Float64) -> tuple[Float64, F
     good = (total > options.enough) & (spread < options.spread * scale) & ~beyond.any(axis=1, keepdims=True)
     good = (good & (middle < options.one_sided * scale))[:, 0]
     return -mean * blend, blend, good
-
-
-def _unit(vectors: Float64) -> Float64:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)

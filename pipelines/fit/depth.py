@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +22,6 @@ from ...datasets import (
     read_frame,
     read_intrinsics,
     read_poses,
-    spacing_of,
     write_cloud_ply,
 )
 from ...datasets.depth.frame import PosedFrame
@@ -31,6 +29,7 @@ from ...datasets.depth.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from ...neural_fields import InputError
 from ...neural_fields.backend.devices import choose_device
 from ...neural_fields.backend.files import files_in, partial_of
+from ..surface.surface import support_radius
 from ..training.folder import CLOUD_FILE, kept_cloud, read_record
 from ..training.result import Run
 from ..training.settings import FitConfig
@@ -138,11 +137,10 @@ def fit_depth(
 def trim_suggestion(run: Path) -> float:
     """A distance for ``mplicits mesh --trim-distance`` that cuts the closing of an open surface off.
 
-    The root of the sum of squares of three spacings, so that no holes appear between points, and of three times the
-    error of the surface, or an inexact fit would be cut away.
+    No holes appear between points, and no inexact fit is cut away; see `support_radius`.
     """
     error = read_record(run)["stages"][-1]["rms_at_points"]
-    return 3 * math.hypot(spacing_of(read_cloud(run / CLOUD_FILE).points), error)
+    return support_radius(read_cloud(run / CLOUD_FILE).points, error=error)
 
 
 def _files(path: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:

@@ -7,6 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def plan_fits(
         raise InputError(f"{both}: would both be fitted into {out / twice[0]}; rename one")
     check_new_run(out, resume=False, force=True)  # it may hold other runs
     if resume:
-        config = _kept_settings(out)
+        config = load_config(FitConfig, None, read_kept(out / SETTINGS_FILE)["config"])
     assert config is not None
     if out.is_dir():
         for path in paths:
@@ -76,7 +77,7 @@ def fit_many(
     check_jobs(jobs)
     out.mkdir(parents=True, exist_ok=True)
     if planned:
-        _keep_settings(out, planned[0].config)
+        write_json(out / SETTINGS_FILE, {"config": dataclasses.asdict(planned[0].config)})
     return run_fits(planned, jobs=jobs, progress=progress, report=report)
 
 
@@ -91,7 +92,7 @@ def run_fits(
     """See `fit_many`, and `run_jobs` for the ``address``; fits whose worker dies go on, twice at most."""
     if jobs > 1 or address is not None or progress is None:
         return run_jobs(_fit, planned, jobs=jobs, address=address, retries=2, report=report)
-    return run_jobs(lambda job: _fit(job, _named(progress, job.cloud.stem)), planned, report=report)
+    return run_jobs(lambda job: _fit(job, partial(progress, job.cloud.stem)), planned, report=report)
 
 
 def format_fits(outcomes: Sequence[FitOutcome]) -> str:
@@ -115,18 +116,6 @@ def _fit(job: FitJob, progress: Report | None = None) -> dict[str, Any]:
     resume = job.resume and (job.directory / STATE_FILE).is_file()
     about = {"resume": resume, "around": job.around, "progress": progress}
     return fit_file(job.cloud, job.config, out=job.directory, **about).record
-
-
-def _named(progress: Callable[[str, Progress], None], name: str) -> Report:
-    return lambda step: progress(name, step)
-
-
-def _keep_settings(out: Path, config: FitConfig) -> None:
-    write_json(out / SETTINGS_FILE, {"config": dataclasses.asdict(config)})
-
-
-def _kept_settings(out: Path) -> FitConfig:
-    return load_config(FitConfig, None, read_kept(out / SETTINGS_FILE)["config"])
 
 
 def read_kept(path: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ...datasets import read_cloud
-from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren, load_field
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, load_field
 from ...neural_fields.backend.files import damage, json_bytes, write_whole
 from ...neural_fields.checkpoint import similarity_of
 from ...neural_fields.networks.encoded import EncodedField
@@ -126,6 +126,7 @@ def _layers_in(path: Path, state: Mapping[str, Tensor]) -> Iterator[tuple[Tensor
         raise InputError(f"{path}: holds no tensors; expected a state dict of a SIREN")
 
 
+@torch.no_grad()
 def read_official(
     paths: str | Path | Sequence[str | Path],
     *,
@@ -164,11 +165,16 @@ def read_official(
         raise InputError(f"{files[0]}: the widths of its bands are not in the files; give {fix}")
     field = MultiscaleSDF(levels[0], [], [])
     if points is not None:
-        _check_on_surface(str(cloud), field, points)
+        median = float(field.value(points).abs().median())
+        if not median < FIXED_BAND:  # points of another frame or another shape, or another ω₀
+            raise InputError(
+                f"{cloud}: half of its points lie more than {median:.2g} from the coarse surface; give the cloud in "
+                "the model's own coordinates (data/normalized_sphere/input), and as --w0 the frequency of its code"
+            )
     for index, level in enumerate(levels[1:]):
         if widths is None:
             assert points is not None
-            delta = delta_of(_values(field, points), epsilon=FitConfig().epsilon, quantile=1.0)
+            delta = delta_of(field.value(points), epsilon=FitConfig().epsilon, quantile=1.0)
         else:
             delta = widths[index]
         field = field.with_level(level, delta=delta)
@@ -197,21 +203,6 @@ def _files_of(paths: str | Path | Sequence[str | Path]) -> tuple[list[Path], _Fr
         if not 0 <= taper <= 1:
             raise ValueError(f"taper {taper:g}")
         return there, _Frame([float(width) for width in held["deltas"]], taper, similarity_of(held))
-
-
-def _check_on_surface(cloud: str, field: Field, points: Tensor) -> None:
-    """Refuse points that are not those of the model: another frame, another shape, or another ω₀."""
-    median = float(_values(field, points).abs().median())
-    if not median < FIXED_BAND:
-        raise InputError(
-            f"{cloud}: half of its points lie more than {median:.2g} from the coarse surface; give the cloud in the "
-            "model's own coordinates (data/normalized_sphere/input), and as --w0 the frequency of its code"
-        )
-
-
-@torch.no_grad()
-def _values(field: Field, points: Tensor) -> Tensor:
-    return field.value(points)
 
 
 def import_official(

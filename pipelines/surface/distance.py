@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from ...datasets.clouds.point_cloud import sums_by
 from ...neural_fields import Jet, Mesh
 from ...neural_fields.fields.field import OneLevelField
 from .surface import face_normals, is_closed, volume
@@ -115,21 +116,15 @@ def _pseudo_normals(mesh: Mesh, normals: Float64, corners: Float64) -> Float64:
     result[:, 7] = normals
     ends = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])
     _, edge = np.unique(ends.min(axis=1) * size + ends.max(axis=1), return_inverse=True)
-    total = _summed(edge.reshape(-1), np.tile(normals, (3, 1)))[edge.reshape(-1)].reshape(3, -1, 3)
+    total = sums_by(edge.reshape(-1), np.tile(normals, (3, 1)))[edge.reshape(-1)].reshape(3, -1, 3)
     for k in range(3):
         result[:, (1 << k) | (1 << (k + 1) % 3)] = total[k]
     angles = np.stack([_angle(corners, k) for k in range(3)], axis=1)  # (F, 3)
     weighted = (angles[..., None] * normals[:, None]).reshape(-1, 3)
-    vertex = _summed(faces.reshape(-1), weighted, size)
+    vertex = sums_by(faces.reshape(-1), weighted, size)
     for k in range(3):
         result[:, 1 << k] = vertex[faces[:, k]]
     return result
-
-
-def _summed(owner: NDArray[np.integer], vectors: Float64, size: int = 0) -> Float64:
-    """Sums ``(K, 3)`` of the vectors ``(N, 3)`` of each owner."""
-    sums = [np.bincount(owner, weights=vectors[:, i], minlength=size) for i in range(3)]
-    return np.stack(sums, axis=1).astype(np.float64)
 
 
 def _angle(corners: Float64, k: int) -> Float64:

@@ -75,8 +75,6 @@ def _load_mesh(path: Path) -> Mesh | None:
         vertices, colors = cloud.points, cloud.colors
         if not len(faces):
             return None
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(f"{path}: a face names vertex {faces.max()}, but there are only {len(vertices)}")
     if not np.isfinite(vertices[np.unique(faces)]).all():
         raise InputError(f"{path}: a vertex has a coordinate that is not a finite number")
     if not np.ptp(vertices[np.unique(faces)], axis=0).any():

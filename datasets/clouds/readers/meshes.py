@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ....neural_fields import InputError
 from ....neural_fields.meshing.mesh import weld
 from ...files import decoded
-from ..point_cloud import PointCloud, colors_from, unit_rows
+from ..point_cloud import PointCloud, colors_from, sums_by, unit_rows
 from .columns import Table, choose_layout, cloud_from
 from .tables import numbers
 
@@ -126,9 +126,7 @@ def vertex_normals(vertices: Float64, faces: NDArray[np.integer]) -> NDArray[np.
     kept, index = weld(vertices)
     a, b, c = (vertices[kept[index[faces[:, k]]]] for k in range(3))
     weighted = np.cross(b - a, c - a)  # direction times twice the area
-    sums = np.stack(
-        [np.bincount(index[faces].T.ravel(), np.tile(weighted[:, k], 3), len(kept)) for k in range(3)], axis=1
-    )
+    sums = sums_by(index[faces].T.ravel(), np.tile(weighted, (3, 1)), len(kept))
     return unit_rows(sums)[index].astype(np.float32)
 
 
@@ -215,8 +213,7 @@ def read_obj(path: Path) -> tuple[PointCloud, Int64]:
         normals = directions.astype(np.float32)
     elif len(corners) and len(directions) and obj.words.count("/") == 2 * len(corners):
         chosen = obj.indices(re.sub(r"\S*/", "", obj.words), starts, obj.used_at, "vn")
-        sums = [np.bincount(corners, directions[chosen, k], len(cloud)) for k in range(3)]
-        normals = np.stack(sums, axis=1).astype(np.float32)
+        normals = sums_by(corners, directions[chosen], len(cloud)).astype(np.float32)
     if normals is not None:
         cloud = dataclasses.replace(cloud, normals=normals, reading=f"{cloud.reading}; normals from vn")
     return as_mesh(cloud, faces), faces

@@ -21,6 +21,7 @@ from ....neural_fields.meshing.mesh import ply_vertices
 from ..point_cloud import PointCloud
 from .columns import Table, TableStream, choose_layout, cloud_from
 from .meshes import as_mesh, strips, triangulate
+from .tables import is_number
 
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -47,7 +48,7 @@ class _Property:
 class _Element:
     name: str
     count: int
-    properties: tuple[_Property, ...]
+    properties: list[_Property]
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ def ply_stream(path: Path, columns: str | None = None) -> TableStream | None:
     if b"end_header" not in head:
         return None
     encoding, elements, body = _parse_header(head, path)
-    vertex = elements[0] if elements else _Element("", 0, ())
+    vertex = elements[0] if elements else _Element("", 0, [])
     names = [p.name for p in vertex.properties]
     if encoding == "ascii" or vertex.name != "vertex" or any(p.length_kind for p in vertex.properties):
         return None
@@ -162,11 +163,11 @@ def _parse_header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
                 case ["format", name, *_] if name in _ORDERS:
                     encoding = name
                 case ["element", name, count] if int(count) >= 0:
-                    elements.append(_Element(name.lower(), int(count), ()))
+                    elements.append(_Element(name.lower(), int(count), []))
                 case ["property", "list", length_kind, kind, name]:
-                    elements[-1] = _with(elements[-1], _Property(name, _KINDS[kind], _KINDS[length_kind]))
+                    elements[-1].properties.append(_Property(name, _KINDS[kind], _KINDS[length_kind]))
                 case ["property", kind, name]:
-                    elements[-1] = _with(elements[-1], _Property(name, _KINDS[kind], None))
+                    elements[-1].properties.append(_Property(name, _KINDS[kind], None))
                 case _:
                     raise ValueError(line)
         except (ValueError, KeyError, IndexError) as error:
@@ -176,10 +177,6 @@ def _parse_header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
     if not encoding:
         raise InputError(f"{path}: format: missing from the header; expected one of {', '.join(_ORDERS)}")
     return encoding, elements, end.end()
-
-
-def _with(element: _Element, added: _Property) -> _Element:
-    return _Element(element.name, element.count, (*element.properties, added))
 
 
 def _ascii_to_doubles(body: bytes, path: Path) -> bytes:
@@ -192,18 +189,16 @@ def _ascii_to_doubles(body: bytes, path: Path) -> bytes:
 
 
 def _first_bad_word(body: bytes) -> str:
-    for number, line in enumerate(body.splitlines(), start=1):
+    for number, line in enumerate(body.decode("ascii", "replace").splitlines(), start=1):
         for word in line.split():
-            try:
-                float(word)
-            except ValueError:
-                return f"line {number} after the header: {word[:40].decode('ascii', 'replace')!r} is not a number"
+            if "," in word or not is_number(word):
+                return f"line {number} after the header: {word[:40]!r} is not a number"
     return "something is not a number"
 
 
 def _as_doubles(element: _Element) -> _Element:
-    doubles = (_Property(p.name, "f8", "f8" if p.length_kind else None) for p in element.properties)
-    return _Element(element.name, element.count, tuple(doubles))
+    doubles = [_Property(p.name, "f8", "f8" if p.length_kind else None) for p in element.properties]
+    return _Element(element.name, element.count, doubles)
 
 
 def _restore(column: NDArray[Any] | _Lists, declared: _Property) -> NDArray[Any]:
