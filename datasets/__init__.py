@@ -13,7 +13,7 @@ from .depth.images import read_color, read_depth
 from .files import is_depth_file
 from .synthetic.samples import add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
 from .synthetic.scanner import STATUE_PLACEMENT, ScanFaults, SimulatedScan, scan_with_truth, simulate_scan, statue_scan
-from .synthetic.scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
+from .synthetic.scenes import SCENES, Scene, render_scene, scene_mesh
 from .synthetic.statue import Statue
 from .textured.reading import TexturedMesh, colors_at, read_textured, sample_textured
 from .views.images import PosedImage, PosedImages, read_cameras, read_posed_images
@@ -27,7 +27,7 @@ __all__ = [
     "fuse_frames", "is_depth_file", "linear_to_srgb", "look_at", "orbit", "prepare_cloud", "read_cameras",
     "read_cloud", "read_color", "read_depth", "read_frame", "read_intrinsics", "read_posed_images", "read_poses",
     "read_textured", "region_from_cameras", "region_from_masks", "region_from_points",
-    "render_scene", "sample_scene", "sample_sphere", "sample_surface", "sample_textured", "sample_torus",
+    "render_scene", "sample_sphere", "sample_surface", "sample_textured", "sample_torus",
     "scan_with_truth", "scene_mesh", "simulate_scan", "spacing_of", "srgb_to_linear", "statue_scan", "thin",
     "turntable", "write_cloud_ply", "write_colmap", "write_neus", "write_transforms",
 ]  # fmt: skip

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,9 +15,9 @@ from torch import Tensor
 from ...neural_fields import Box, Capsule, Field, FunctionField, Similarity, Sphere, Torus, Union, sphere_trace
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ...neural_fields.meshing.extract import Mesh, extract_mesh
+from ...neural_fields.tracing.sphere import Hits
 from ..cameras import UP_AXES, Camera, look_at
 from ..clouds.cleaning.orientation import fibonacci_directions
-from ..clouds.point_cloud import PointCloud
 from ..views.formats.shots import DepthMap
 from ..views.images import PosedImage, PosedImages
 from .corner import corner, corner_colors
@@ -87,20 +86,16 @@ def render_scene(
         shaded: whether a fixed lamp lights the shape; without it, the images show the paint itself.
         glossy: whether the lamp has a highlight that moves with the eye.
         depths: whether each image has the depths of its pixels' centres.
-        progress: called with ``(done, total)`` after every image, or several small ones.
+        progress: called with ``(done, total)`` after every image.
 
     Raises:
         ValueError: ``views``, ``size`` or ``samples`` is not positive.
     """
-    cameras = scene_cameras(scene, views=views, size=size, seed=seed)
-    pixels = cameras[0].width * cameras[0].height
-    together = max(1, RAYS_AT_ONCE // max(1, pixels * samples**2))
     images: list[PosedImage] = []
-    for first in range(0, views, together):
-        some = cameras[first : first + together]
-        maps = scene_depths(scene, some) if depths else [None] * len(some)
-        for camera, seen, depth in zip(some, _pictures(scene, some, samples, shaded, glossy), maps, strict=True):
-            images.append(PosedImage(f"{len(images):03d}.png", camera, *seen, depth))
+    for camera in scene_cameras(scene, views=views, size=size, seed=seed):
+        color, mask = render_view(scene, camera, samples=samples, shaded=shaded, glossy=glossy)
+        depth = scene_depths(scene, camera) if depths else None
+        images.append(PosedImage(f"{len(images):03d}.png", camera, color, mask, depth))
         if progress is not None:
             progress(len(images), views)
     points = sample_surface(scene.field, 1000, seed=seed).points
@@ -108,33 +103,18 @@ def render_scene(
     return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name), seen)
 
 
-def scene_depths(scene: Scene, cameras: Sequence[Camera]) -> list[DepthMap]:
-    """Depths ``(H, W)`` along the axes of view at the centres of cameras' pixels, traced together; NaN for a miss."""
-    maps = []
-    for camera, hits in zip(cameras, _traced(scene, cameras), strict=True):
-        ahead = (hits.position - camera.eye) @ camera.forward
-        numbers = torch.where(hits.mask, ahead, torch.nan).float().numpy()
-        maps.append(DepthMap(numbers, camera, "metric", Path(scene.name)))
-    return maps
+def scene_depths(scene: Scene, camera: Camera) -> DepthMap:
+    """Depths ``(H, W)`` along the axis of view at the centres of a camera's pixels; NaN for a miss."""
+    hits, _ = _traced(scene, camera)
+    ahead = (hits.position - camera.eye) @ camera.forward
+    numbers = torch.where(hits.mask, ahead, torch.nan).float().numpy()
+    return DepthMap(numbers, camera, "metric", Path(scene.name))
 
 
-class _Seen(NamedTuple):
-    """Hits of the rays of a camera."""
-
-    mask: Tensor  # (H, W)
-    position: Tensor  # (H, W, 3)
-    direction: Tensor  # (H, W, 3)
-
-
-def _traced(scene: Scene, cameras: Sequence[Camera]) -> list[_Seen]:
-    """Trace the rays of several cameras together: a few rays take as long as thousands."""
-    rays = [camera.rays(dtype=torch.float64) for camera in cameras]
-    eyes = torch.cat([eye.expand_as(directions).reshape(-1, 3) for eye, directions in rays])
-    along = torch.cat([directions.reshape(-1, 3) for _, directions in rays])
-    hits = sphere_trace(scene.field, eyes, along, tolerance=1e-9, lipschitz=scene.lipschitz)
-    sizes = [camera.height * camera.width for camera in cameras]
-    parts = zip(cameras, *(part.split(sizes) for part in (hits.mask, hits.position, along)), strict=True)
-    return [_Seen(*(part.unflatten(0, (camera.height, camera.width)) for part in own)) for camera, *own in parts]
+def _traced(scene: Scene, camera: Camera) -> tuple[Hits, Tensor]:
+    """Hits of a camera's rays ``(H, W)``, and their directions ``(H, W, 3)``."""
+    eye, along = camera.rays(dtype=torch.float64)
+    return sphere_trace(scene.field, eye.expand_as(along), along, tolerance=1e-9, lipschitz=scene.lipschitz), along
 
 
 def _observations(scene: Scene, points: Float64, cameras: Sequence[Camera]) -> NDArray[np.int64]:
@@ -153,37 +133,19 @@ def render_view(
     scene: Scene, camera: Camera, *, samples: int = 3, shaded: bool = False, glossy: bool = False
 ) -> tuple[Float32, Float32]:
     """One picture of a scene (see `developed`): display RGB ``(H, W, 3)`` and mask ``(H, W)``, both in [0, 1]."""
-    return _pictures(scene, [camera], samples, shaded, glossy)[0]
-
-
-def _pictures(
-    scene: Scene, cameras: Sequence[Camera], samples: int, shaded: bool, glossy: bool
-) -> list[tuple[Float32, Float32]]:
-    """`render_view` of several cameras of one size: some rows of all of them at a time."""
     if samples < 1:
         raise ValueError(f"samples={samples}: expected at least one")
-    width, height = cameras[0].width, cameras[0].height
-    rows = max(1, RAYS_AT_ONCE // (len(cameras) * width * samples**2))
-    strips = [
-        _strips(scene, [c.strip(first, min(rows, height - first)) for c in cameras], samples, shaded, glossy)
-        for first in range(0, height, rows)
-    ]
-    views = ((np.concatenate(part) for part in zip(*own, strict=True)) for own in zip(*strips, strict=True))
-    return [(color, mask) for color, mask in views]
-
-
-def _strips(
-    scene: Scene, cameras: Sequence[Camera], samples: int, shaded: bool, glossy: bool
-) -> list[tuple[Float32, Float32]]:
-    """Colours and masks of some rows of `_pictures`, whose rays are traced together."""
-    pictures = []
-    fine = [camera.resized(samples * camera.width, samples * camera.height) for camera in cameras]
-    for seen in _traced(scene, fine):
-        mask = seen.mask.numpy()
+    rows = max(1, RAYS_AT_ONCE // (camera.width * samples**2))
+    strips = []
+    for first in range(0, camera.height, rows):
+        strip = camera.strip(first, min(rows, camera.height - first))
+        hits, along = _traced(scene, strip.resized(samples * strip.width, samples * strip.height))
+        mask = hits.mask.numpy()
         light = np.zeros((*mask.shape, 3))
-        light[mask] = _light(scene, seen.position.numpy()[mask], seen.direction.numpy()[mask], shaded, glossy)
-        pictures.append(developed(light, mask, samples))
-    return pictures
+        light[mask] = _light(scene, hits.position.numpy()[mask], along.numpy()[mask], shaded, glossy)
+        strips.append(developed(light, mask, samples))
+    color, mask = (np.concatenate(part) for part in zip(*strips, strict=True))
+    return color, mask
 
 
 def _light(scene: Scene, points: Float64, directions: Float64, shaded: bool, glossy: bool) -> Float64:
@@ -203,12 +165,6 @@ def scene_mesh(scene: Scene, *, resolution: int = 256) -> Mesh:
     bounds = ((-side, -side, -side), (side, side, side))
     mesh = extract_mesh(scene.field, resolution=resolution, bounds=bounds, lipschitz=max(1.25, scene.lipschitz))
     return replace(mesh, colors=scene.color(mesh.vertices).astype(np.float32))
-
-
-def sample_scene(scene: Scene, count: int, *, seed: int = 0) -> PointCloud:
-    """``count`` points of the true surface, evenly by area, with exact normals and colours."""
-    cloud = sample_surface(scene.field, count, seed=seed)
-    return replace(cloud, colors=scene.color(cloud.points).astype(np.float32), source=scene.name)
 
 
 def _figure() -> Scene:

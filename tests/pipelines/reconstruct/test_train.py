@@ -12,7 +12,8 @@ from evolutions import fails
 from fits import assert_same, interrupt
 from mplicits.datasets import read_cloud
 from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
-from mplicits.datasets.synthetic.scenes import SCENES, render_scene, sample_scene
+from mplicits.datasets.synthetic.samples import sample_surface
+from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImage, PosedImages
 from mplicits.datasets.views.writing import write_neus, write_transforms
 from mplicits.neural_fields import ColorNetwork, InputError, Similarity, Sphere, extract_mesh, load_field
@@ -302,7 +303,7 @@ def test_a_painted_sphere_is_recovered_from_its_pictures(tmp_path: Path, monkeyp
     seen = mesh.vertices[np.linalg.norm(mesh.vertices, axis=1) < 1]
     here = WORLD.to_unit(run.images.similarity.to_input(seen))
     assert abs(np.linalg.norm(here, axis=1) - 0.6).mean() < 0.004
-    assert sum(chamfer(here, sample_scene(scene, 20_000).points)) < 3e-4
+    assert sum(chamfer(here, sample_surface(scene.field, 20_000).points)) < 3e-4
     assert run.record["held_out"]["psnr"] > 27
     assert run.record["inv_std"] > 100
 
