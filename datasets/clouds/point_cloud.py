@@ -94,9 +94,10 @@ def unit_rows(vectors: NDArray[np.floating] | NDArray[np.integer]) -> NDArray[np
     return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0)
 
 
-def sums_by(owner: Int64, vectors: Float64, count: int = 0) -> Float64:
+def sums_by(owner: NDArray[np.integer], vectors: Float64, count: int = 0) -> Float64:
     """Sums ``(count, 3)`` of the vectors ``(N, 3)`` of each owner, numbered from 0."""
-    return np.stack([np.bincount(owner, vectors[:, axis], count) for axis in range(3)], axis=1)
+    sums = [np.bincount(owner, weights=vectors[:, axis], minlength=count) for axis in range(3)]
+    return np.stack(sums, axis=1).astype(np.float64)
 
 
 def select(cloud: PointCloud, index: NDArray[np.integer] | NDArray[np.bool_]) -> PointCloud:
