@@ -149,7 +149,8 @@ def _collected(ray: Any, done: Any, item: Item) -> Outcome[Item, Any]:
     try:
         return ray.get(done)
     except ray.exceptions.RayError as error:
-        reason = (str(error).splitlines() or [""])[0]
+        lines = str(error).splitlines() or [""]
+        reason = lines[-1] if isinstance(error, ray.exceptions.RayTaskError) else lines[0]  # the end of a traceback
         return Outcome(item, None, f"{type(error).__name__}: {reason}", math.nan)
 
 

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mplicits.neural_fields import Similarity, Sphere, extract_mesh
+from mplicits.neural_fields import Similarity, Sphere, extract_mesh, save_field
 from mplicits.neural_fields.fields.similarity import Placement
 from mplicits.pipelines.mesh.bake import textured_mesh
 from mplicits.pipelines.mesh.files import write_mesh, write_moving
+from mplicits.pipelines.mesh.scene import SceneOptions, scene_of_run
 from npm import VALIDATOR, fetch
 
 UTM = Similarity((512_345.678, 5_403_210.987, 312.5), 40.0)
@@ -64,6 +65,13 @@ def write_motion(path, mesh):
     write_moving(path, mesh.faces, frames, [mesh.normals] * 3, seconds=np.arange(3.0), colors=mesh.colors, **place)
 
 
+def write_tile(path, mesh):
+    """The coarsest tile of a scene, in place of a mesh."""
+    save_field(path.with_name("field.safetensors"), Sphere(radius=0.7), similarity=UTM)
+    scene_of_run(path.with_name("field.safetensors"), path.with_name("scene"), SceneOptions(resolution=32, cells=16))
+    path.with_name("scene").joinpath("tiles", "1", "0_0_0.glb").replace(path)
+
+
 WRITERS = {
     "plain": lambda path, mesh: write_mesh(path, plain(mesh)),
     "colored": lambda path, mesh: write_mesh(path, mesh, UTM),
@@ -71,6 +79,7 @@ WRITERS = {
     "turned": lambda path, mesh: write_mesh(path, mesh, UTM, Placement("z", "ft")),
     "baked": write_baked,
     "motion": write_motion,
+    "tile": write_tile,
 }
 
 
