@@ -7,6 +7,7 @@ import itertools
 import math
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,10 +22,10 @@ from scipy.spatial import KDTree
 from ...datasets import spacing_of
 from ...datasets.clouds.point_cloud import unit_rows
 from ...neural_fields import InputError, Mesh, Similarity
-from ...neural_fields.backend.files import check_place, partial_of, rename, write_json
+from ...neural_fields.backend.files import check_place, partial_of, remove, rename, write_json
 from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing._cells import Bounds
-from ...neural_fields.meshing.extract import DEFAULT_BOUNDS, surface_needed
+from ...neural_fields.meshing.extract import DEFAULT_BOUNDS, NoSurfaceError, surface_needed
 from ...neural_fields.meshing.mesh import write_glb_mesh
 from ...neural_fields.meshing.parts import Place, extract_parts
 from ..surface.surface import Footing, Support, component_of_faces, footing, keep_faces, read_support
@@ -38,6 +39,7 @@ from .files import placement_of
 
 SCENE_FILE = "tileset.json"
 SEEN = 10_000  # points of each mesh at which errors are measured: of the Armadillo, 50,000 find the same
+TILES = "tiles"  # folder of the GLB files
 PARTS = "parts"  # folder of the meshes, while a scene is written
 _CUBE = list(itertools.product((0, 1), repeat=3))
 
@@ -48,6 +50,7 @@ class SceneOptions:
 
     Attributes:
         resolution: cells along the side of the cube around the unit sphere, at the finest; None as in `MeshOptions`.
+        time: the moment, for a surface that moves.
         level: of the finest tiles, counted from 0, the coarsest; None is the finest. Tiles of twice the size have the
             level before.
         colors: whether vertices get the colours of the run's texture, if it has one.
@@ -59,6 +62,7 @@ class SceneOptions:
     """
 
     resolution: int | None = None
+    time: float | None = None
     level: int | None = None
     colors: bool = True
     keep_unsupported: bool = False
@@ -107,26 +111,28 @@ def scene_of_run(
     options, out, say = options or SceneOptions(), Path(out), say or (lambda _: None)
     placement = placement_of(options.up, options.unit, False)
     check_place(out)
-    if out.exists() and not (out / SCENE_FILE).is_file() and (not out.is_dir() or any(out.iterdir())):
+    inside = {path.name for path in out.iterdir()} if out.is_dir() else {"a file"} if out.exists() else set()
+    if SCENE_FILE not in inside and inside - {TILES}:
         raise InputError(f"{out}: holds something that is no 3D Tiles scene; name another folder")
     file = find_field(run)
-    field, similarity, metadata = load_still(file)
+    field, similarity, metadata = load_still(file, options.time)
     level = chosen_level(field, file, options.level)
-    support = read_support(file, metadata.get("run", {}), level)
+    support = None if options.time is not None else read_support(file, metadata.get("run", {}), level)
     stand = _stand(options, placement, similarity, metadata.get("run", {}), file)
     say(f"coordinates: {stand.line}")
     resolution = chosen_resolution(field, options.resolution, support, level, say)
     bounds, cells, steps = _lattice(support, resolution, options.cells)
     colored = options.colors and file.with_name(TEXTURE_FILE).is_file()
-    colors = colors_of_run(file, field, None) if colored else None
+    colors = colors_of_run(file, field, options.time) if colored else None
     partial = partial_of(out)
     try:
-        with surface_needed(f"{file}: no surface to mesh"):
-            for step in range(steps):
-                folder = partial / PARTS / str(step)
-                folder.mkdir(parents=True)
-                size, used = cells // 2**step, max(0, level - step)
-                show = counted(report or silent, f"tiles of {size} cells per side")
+        for step in range(steps):
+            folder = partial / PARTS / str(step)
+            folder.mkdir(parents=True)
+            size, used = cells // 2**step, max(0, level - step)
+            show = counted(report or silent, f"tiles of {size} cells per side")
+            # Coarse cells may miss all of a thin surface.
+            with surface_needed(f"{file}: no surface to mesh") if step == 0 else suppress(NoSurfaceError):
                 for part in extract_parts(
                     field,
                     resolution=size,
@@ -136,8 +142,8 @@ def scene_of_run(
                     progress=lambda _, done, total, show=show: show(done, total),
                 ):
                     _keep(folder, part.place, part.mesh, shared=part.shared, edges=part.edges)
-                if support is not None and not support.visible and not options.keep_unsupported:
-                    _drop_unsupported(folder, support)
+            if support is not None and not support.visible and not options.keep_unsupported:
+                _drop_unsupported(folder, support)
         writer = _Writer(partial, stand, similarity, colors, counted(report or silent, "writing tiles"))
         root = writer.tile(steps - 1, (0, 0, 0))
         assert root is not None
@@ -145,10 +151,11 @@ def scene_of_run(
         root.entry["transform"] = stand.transform.T.ravel().tolist()  # column by column
         root.entry["refine"] = "REPLACE"
         scene = {"asset": {"version": "1.1"}, "geometricError": max(extent, root.error), "root": root.entry}
-        shutil.rmtree(partial / PARTS)
-        write_json(partial / SCENE_FILE, scene)
-        shutil.rmtree(out, ignore_errors=True)  # an older scene
-        rename(partial, out)
+        out.mkdir(parents=True, exist_ok=True)
+        remove(out / SCENE_FILE)  # of an older scene
+        shutil.rmtree(out / TILES, ignore_errors=True)
+        rename(partial / TILES, out / TILES)
+        write_json(out / SCENE_FILE, scene)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return Scene(writer.tiles, steps, writer.faces, root.error)
@@ -203,6 +210,8 @@ def _kept(path: Path) -> tuple[Mesh, NDArray[Any], NDArray[Any]]:
 def _drop_unsupported(folder: Path, support: Support) -> None:
     """Drop the components, followed from part to part, that no points support; see `drop_unsupported`."""
     paths = sorted(folder.iterdir())
+    if not paths:
+        return
     tree, total = KDTree(support.points), 0
     numbers: list[NDArray[np.intp]] = []
     edges, owners, found = [], [], []
@@ -291,7 +300,7 @@ class _Writer:
         return dataclasses.replace(mesh, vertices=vertices, normals=normals, colors=colors)
 
     def _write(self, step: int, place: Place, mesh: Mesh) -> str:
-        name = f"tiles/{step}/{'_'.join(map(str, place))}.glb"
+        name = f"{TILES}/{step}/{'_'.join(map(str, place))}.glb"
         path = self.out / name
         path.parent.mkdir(parents=True, exist_ok=True)
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from mplicits.neural_fields import InputError, Similarity, Sphere, Union, save_field
+from mplicits.neural_fields import Box, InputError, Similarity, Sphere, Union, save_field
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.scene import SceneOptions, scene_of_run
 
@@ -114,6 +114,18 @@ def test_on_the_globe_every_vertex_is_where_its_system_says(run, tmp_path):
     assert matrix[:3, 2] @ matrix[:3, 3] / np.linalg.norm(matrix[:3, 3]) > 0.99  # up is away from the globe
 
 
+def test_a_plate_that_coarse_cells_miss(tmp_path):
+    """Half a cell of the coarsest step thick, between its lattice planes: finer tiles hang below an empty one."""
+    run, out = tmp_path / "field.safetensors", tmp_path / "scene"
+    save_field(run, Box(center=(0.01, 0.01, 0.06), half_size=(0.5, 0.5, 0.02)))
+    scene_of_run(run, out, SceneOptions(resolution=64, cells=16))
+    root = json.loads((out / "tileset.json").read_text())["root"]
+    assert "content" not in root
+    low, high = box_of(root)
+    assert root["geometricError"] >= np.linalg.norm(high - low)
+    assert any("content" in tile for tile in entries(root))
+
+
 def test_units_and_axes_without_a_system(run, tmp_path):
     out = tmp_path / "scene"
     scene_of_run(run, out, SceneOptions(resolution=32, cells=32, up="y", unit="mm"))
@@ -127,9 +139,11 @@ def test_an_older_scene_is_replaced_and_nothing_else(run, tmp_path, capsys):
     out = tmp_path / "scene"
     command = ["mesh", str(run), "-o", str(out), "--format", "3dtiles", "--resolution", "24"]
     assert main(command) == 0
-    (out / "old").touch()
+    (out / "viewer.html").touch()
+    (out / "tiles" / "old.glb").touch()
     assert main(command) == 0
-    assert not (out / "old").exists()
+    assert sorted(path.name for path in out.iterdir()) == ["tiles", "tileset.json", "viewer.html"]
+    assert not (out / "tiles" / "old.glb").exists()
     full = tmp_path / "full"
     full.mkdir()
     (full / "thesis.tex").touch()
