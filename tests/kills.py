@@ -52,7 +52,8 @@ RECONSTRUCT = (
     "--features 4 --color-width 8 --color-depth 1 --color-grid 8 --rays 16 --uniform 8 --importance 4 --device cpu "
     "--quiet"
 )
-COMMANDS = ("fit", "texture", "reconstruct", "evolve", "bench")
+COMMANDS = ("fit", "texture", "reconstruct", "evolve", "bench", "tiles")
+FRESH = ("bench", "tiles")  # not begun over a finished run
 
 
 class Case(NamedTuple):
@@ -71,6 +72,7 @@ def words(command: str, place: Path, run: Path, *, resume: bool, force: bool) ->
         "texture": f"texture {run} {place}/ball.ply " + ("" if resume else TEXTURE),
         "reconstruct": f"reconstruct {place}/views -o {run} " + ("" if resume else RECONSTRUCT),
         "evolve": f"evolve -o {run} " + ("" if resume else f"sphere:0.4@-0.2,0,0 {EVOLVE}"),
+        "tiles": f"fit {place}/ball.ply -o {run} " + ("" if resume else f"{FIT} --tile-size 1.2"),
         "bench": f"bench fit {place}/sphere.ply -o {run} --resolution 16 --eval-samples 500 "
         + FIT.replace("--quiet", ""),
     }[command]
@@ -147,6 +149,8 @@ def result(command: str, run: Path) -> dict[str, torch.Tensor] | None:
     if not is_fitted(run):
         return None
     tensors = load_file(run / "field.safetensors")
+    for tile in run.glob("tiles/*"):
+        tensors |= {f"{tile.name}.{name}": part for name, part in load_file(tile / "field.safetensors").items()}
     if command == "reconstruct" and (run / "texture.safetensors").is_file():
         tensors |= {f"texture.{name}": part for name, part in load_file(run / "texture.safetensors").items()}
     return tensors
@@ -212,15 +216,15 @@ class Trial:
     def case(self, number: int, case: Case) -> str:
         """What became of a case: what was found after the kills, and the end of it."""
         command, run = case.command, self.place / f"case-{number}"
-        if case.force and command != "bench":
+        if case.force and command not in FRESH:
             shutil.copytree(self.olds[command], run)
             self.age(command, run)
         else:
             run = self.fresh(f"case-{number}", command)
-        old = result(command, run) if case.force and command != "bench" else None
+        old = result(command, run) if case.force and command not in FRESH else None
         found, resume = [], False
         for moment in (*case.moments, None):
-            line = words(command, self.place, run, resume=resume, force=case.force)
+            line = words(command, self.place, run, resume=resume, force=case.force and command not in FRESH)
             cpu = float("inf") if moment is None else moment * self.takes[command]
             code = ended(begun(line, self.place / "said"), cpu)
             if code is not None:
@@ -262,6 +266,8 @@ class Trial:
             return "resumable" if any((each / "resume.safetensors").is_file() for each in runs) else "bench"
         if not run.is_dir():
             return "nothing"
+        if command == "tiles" and not is_fitted(run):
+            return "resumable" if (run / "tiles.json").is_file() else "nothing"
         try:
             find_field(run)
         except InputError:
@@ -305,7 +311,7 @@ def main() -> int:
                 outcome = trial.case(number, case)
             except (AssertionError, InputError) as error:
                 outcome = f"bad: {error}"
-            name = case.command + " --force" * (case.force and case.command != "bench")
+            name = case.command + " --force" * (case.force and case.command not in FRESH)
             if outcome.startswith("bad"):
                 bad += 1
                 print(f"case {number}, {name}, killed at {case.moments}: {outcome}", flush=True)

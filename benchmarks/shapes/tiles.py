@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from mplicits.datasets.clouds.large import merge_cloud
-from mplicits.datasets.clouds.tiling import TilePlan
+from mplicits.datasets.clouds.tiling import TilePlan, plan_tiles
 from mplicits.neural_fields import Field, Mesh, Similarity, extract_mesh
 from mplicits.pipelines.fit.tiles import fit_tiles, plan_fit
 from mplicits.pipelines.fit.train import fit, prepare
@@ -132,6 +132,8 @@ class TilesBench(Benchmark[TilesRow]):
             memory = run.record["peak_memory"]
             file.unlink()
         elif method == SINGLE:
+            # Of a network that knows no borders: how much harder the town is where they would be.
+            plan, _ = plan_tiles(scan)
             run = fit(scan.cloud(), self.config, out=home / "run", progress=context.progress)
             field, similarity = run.field, run.similarity
         else:
@@ -164,7 +166,7 @@ class TilesBench(Benchmark[TilesRow]):
             TilesRow(
                 method=method,
                 points=self.points,
-                tiles=1 if plan is None else plan.num_tiles,
+                tiles=plan.num_tiles if plan is not None and method == TILED else 1,
                 sort_seconds=sorting or 0.0,
                 fit_seconds=seconds,
                 memory=memory / 2**20,
