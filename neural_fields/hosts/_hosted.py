@@ -190,6 +190,7 @@ class _Waiting:
     module: nn.Module
     tensors: tuple[Tensor, ...]
     state: tuple[object, ...]
+    token: object  # tells this pair from others
 
     def fits(self, half: Half, points: Tensor, module: nn.Module, tensors: Sequence[Tensor]) -> bool:
         """Whether this is the requested half, and nothing has changed since it was evaluated."""
@@ -236,7 +237,13 @@ class PointMemo:
         value, gradient = evaluate()
         handed, kept = (value, gradient) if half == "value" else (gradient, value)
         if countable:
-            forget = _forgetter(weakref.ref(self))
+            memo, token = weakref.ref(self), object()
+
+            def forget(_: object) -> None:
+                owner = memo()
+                if owner is not None and owner._waiting is not None and owner._waiting.token is token:
+                    owner._waiting = None
+
             self._waiting = _Waiting(
                 "gradient" if half == "value" else "value",
                 kept,
@@ -245,27 +252,11 @@ class PointMemo:
                 module,
                 tensors,
                 _state(points, module, tensors),
+                token,
             )
             if handed.requires_grad:
-                kept_entry = weakref.ref(self._waiting)
-                handed.register_hook(lambda _: self._forget(kept_entry()))
+                handed.register_hook(forget)
         return handed
-
-    def _forget(self, waiting: _Waiting | None) -> None:
-        if self._waiting is waiting:
-            self._waiting = None
-
-
-def _forgetter(memo: weakref.ref[PointMemo]) -> Callable[[object], None]:
-    """Callback for the death of one of the memo's tensors."""
-
-    def forget(dead: object) -> None:
-        owner = memo()
-        waiting = None if owner is None else owner._waiting
-        if owner is not None and waiting is not None and (dead is waiting.points or dead is waiting.handed):
-            owner._forget(waiting)
-
-    return forget
 
 
 def _state(points: Tensor, module: nn.Module, tensors: Sequence[Tensor]) -> tuple[object, ...]:
