@@ -206,10 +206,6 @@ SLICE = Command(
 )
 
 
-MOVING = (*FILMS, ".png")
-ANIMATED_SHADINGS = ("lambert", "headlight", "normals", "color")
-
-
 def _animate_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("run", metavar="RUN", help="run directory or .safetensors file of `mplicits evolve`")
@@ -228,12 +224,13 @@ def _animate_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--up", of="film, and a .glb, which is turned y-up: ")
     add_flags(parser, "--azimuth", "--elevation", "--samples", of="film: ")
     add_flags(parser, "--zoom", help="film: magnification of the middle (1)")
-    add("--shading", choices=ANIMATED_SHADINGS, help="film: how it is shaded (lambert)")
+    shadings = ("lambert", "headlight", "normals", "color")
+    add("--shading", choices=shadings, help="film: how it is shaded (lambert)")
     add("--shadows", action="store_true", help="film: shadows and occlusion, for twice the time or more")
 
 
 def _animate(arguments: argparse.Namespace) -> int:
-    film = arguments.out.suffix.lower() in MOVING
+    film = arguments.out.suffix.lower() in (*FILMS, ".png")
     if film:
         refuse(arguments, ["resolution"], "goes with meshes; a film is traced in pixels (--size)")
     else:

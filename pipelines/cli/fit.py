@@ -347,6 +347,7 @@ def _describe_level(level: Any, stage: dict[str, Any]) -> str:
 
 def _describe_record(record: dict[str, Any], path: Path) -> Rows:
     from ...datasets import CleaningReport
+    from ..training.folder import resumes_with
 
     if not record:
         return []
@@ -365,7 +366,11 @@ def _describe_record(record: dict[str, Any], path: Path) -> Rows:
             what = f"turned {signs['turned_normals']:,} of {cleaning.get('kept', 0):,} normals"
         what += f" (slope along them {signs['slope']:.2f})"
         rows.append(("signs", f"level 0, trained without orientation, {what}"))
-    rows.append(("state", _describe_state(record, path)))
+    state = "finished" if record.get("finished") else "unfinished"
+    if not record.get("finished") and path.is_dir():
+        again = resumes_with(path, record)
+        state += f": {again}" if again else ", with nothing to resume from: begin again with --force"
+    rows.append(("state", state))
     texture = record.get("texture")
     if texture and not texture.get("finished", True):
         rows.append(("texture", f"unfinished: {command_line('texture', path, texture['source'], '--resume')}"))
@@ -378,18 +383,6 @@ def _describe_record(record: dict[str, Any], path: Path) -> Rows:
     if "seed" in record.get("config", {}):
         rows.append(("seed", str(record["config"]["seed"])))
     return rows
-
-
-def _describe_state(record: dict[str, Any], path: Path) -> str:
-    """Whether the training is finished, and what to type if not."""
-    if record.get("finished"):
-        return "finished"
-    from ..training.folder import resumes_with
-
-    if not path.is_dir():
-        return "unfinished"
-    again = resumes_with(path, record)
-    return f"unfinished: {again}" if again else "unfinished, with nothing to resume from: begin again with --force"
 
 
 def _describe_surface(surface: Mesh, reading: str) -> Rows:

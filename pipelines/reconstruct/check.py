@@ -108,9 +108,6 @@ def _seen_through(
     return through / told if told >= 50 else None
 
 
-Bool = NDArray[np.bool_]
-
-
 @dataclass(frozen=True)
 class CameraLimits:
     """What is warned of. The values are this project's own, from data sets with and without faults."""
@@ -281,7 +278,7 @@ def _field_of_view(camera: Camera) -> tuple[float, float]:
     return across, down
 
 
-def _placement(eyes: Float64, forward: Float64, middle: Bool) -> Iterator[str]:
+def _placement(eyes: Float64, forward: Float64, middle: NDArray[np.bool_]) -> Iterator[str]:
     """Warnings about where cameras stand and look."""
     count, distance = len(eyes), np.linalg.norm(eyes, axis=1)
     if count == 1:
