@@ -231,8 +231,34 @@ def _normal_map(arguments: argparse.Namespace) -> int:
     return run_benches(arguments, [NormalMapBench(run_file=arguments.run, picture=picture, **options)], out=out)
 
 
+SOLIDS = ("box", "cylinder", "gear")
+
+
+def _solid_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", choices=SOLIDS, help="which one")
+    add_flags(parser, "--out", help="a .ply file to write")
+
+
+def _solid(arguments: argparse.Namespace) -> int:
+    check_output(arguments.out, (".ply",))
+    from mplicits.datasets.synthetic.prisms import PRISMS
+    from mplicits.neural_fields import Mesh
+    from mplicits.pipelines.mesh import write_mesh
+
+    write_mesh(arguments.out, Mesh(*PRISMS[arguments.name]()))
+    command = f"python -m benchmarks fit {arguments.out} --points 12000"
+    print(f"{arguments.out}: an exact mesh; `{command}` fits points drawn on it")
+    return 0
+
+
 SHAPES: Mapping[str, Command] = MappingProxyType(
     {
+        "solid": Command(
+            "write the mesh of a solid with sharp edges",
+            "  python -m benchmarks solid gear -o gear.ply",
+            _solid_arguments,
+            _solid,
+        ),
         "fit": Command(
             "how near fits come: ours per level, screened Poisson",
             """  python -m benchmarks fit armadillo.ply --time-budget 180

@@ -47,7 +47,7 @@ class Hosted(nn.Module):
             scale = 1.0 if bounds is None else 1 / math.hypot(*corner)
         positive(scale=scale)
         self.field, self.scale, self.bounds = as_field(field), float(scale), box
-        self.pace = pace
+        self.pace, self._memo = pace, PointMemo()
         if learning_rate is not None:
             rescale_parameters(self.field, learning_rate, pace=pace)
 
@@ -119,6 +119,24 @@ class Hosted(nn.Module):
         laplacian = self.scale * hessian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
         return Jet(value / self.scale, gradient, features), laplacian
 
+    def _features(self, x: Tensor) -> Tensor:
+        """Distance and features ``(..., 1 + F)``; with a graph they come from the jet that has the gradient too."""
+        if not torch.is_grad_enabled():  # nor could the host ask for a gradient, which it takes by autograd
+            return self._value_features(x)
+        return self._memo.ask("value", x, self.field, lambda: self._halves(x))
+
+    def _gradient(self, x: Tensor) -> Tensor:
+        """Gradient, with its graph; like NeuS, leaves ``x`` requiring gradients."""
+        gradient = self._memo.ask("gradient", x, self.field, lambda: self._halves(x))
+        if torch.is_grad_enabled() and not x.is_inference():
+            x.requires_grad_(True)
+        return gradient
+
+    def _halves(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance and features, and the gradient, in the host's shapes."""
+        jet = self._jet(x)
+        return joined(jet), jet.gradient
+
 
 def as_bounds(box: Box) -> Bounds:
     """Two corners as plain numbers; ValueError unless ``(2, 3)`` with the second above the first."""
@@ -132,13 +150,6 @@ def as_bounds(box: Box) -> Bounds:
 def joined(jet: Jet) -> Tensor:
     """Distance and features in one tensor ``(..., 1 + F)``."""
     return torch.cat((jet.value[..., None], jet.features), dim=-1)
-
-
-def mark(x: Tensor, gradient: Tensor) -> Tensor:
-    """Return ``gradient``, with ``x`` requiring gradients from now on."""
-    if torch.is_grad_enabled() and not x.is_inference():
-        x.requires_grad_(True)
-    return gradient
 
 
 def _full_precision(x: Tensor) -> torch.autocast:
@@ -179,6 +190,7 @@ class _Waiting:
     module: nn.Module
     tensors: tuple[Tensor, ...]
     state: tuple[object, ...]
+    token: object  # tells this pair from others
 
     def fits(self, half: Half, points: Tensor, module: nn.Module, tensors: Sequence[Tensor]) -> bool:
         """Whether this is the requested half, and nothing has changed since it was evaluated."""
@@ -225,7 +237,13 @@ class PointMemo:
         value, gradient = evaluate()
         handed, kept = (value, gradient) if half == "value" else (gradient, value)
         if countable:
-            forget = _forgetter(weakref.ref(self))
+            memo, token = weakref.ref(self), object()
+
+            def forget(_: object) -> None:
+                owner = memo()
+                if owner is not None and owner._waiting is not None and owner._waiting.token is token:
+                    owner._waiting = None
+
             self._waiting = _Waiting(
                 "gradient" if half == "value" else "value",
                 kept,
@@ -234,27 +252,11 @@ class PointMemo:
                 module,
                 tensors,
                 _state(points, module, tensors),
+                token,
             )
             if handed.requires_grad:
-                kept_entry = weakref.ref(self._waiting)
-                handed.register_hook(lambda _: self._forget(kept_entry()))
+                handed.register_hook(forget)
         return handed
-
-    def _forget(self, waiting: _Waiting | None) -> None:
-        if self._waiting is waiting:
-            self._waiting = None
-
-
-def _forgetter(memo: weakref.ref[PointMemo]) -> Callable[[object], None]:
-    """Callback for the death of one of the memo's tensors."""
-
-    def forget(dead: object) -> None:
-        owner = memo()
-        waiting = None if owner is None else owner._waiting
-        if owner is not None and waiting is not None and (dead is waiting.points or dead is waiting.handed):
-            owner._forget(waiting)
-
-    return forget
 
 
 def _state(points: Tensor, module: nn.Module, tensors: Sequence[Tensor]) -> tuple[object, ...]:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ..backend.errors import positive
 from ..fields.field import FieldLike
 from ..volume.weights import neus_alpha
-from ._hosted import Box, Hosted, PointMemo, joined, mark
+from ._hosted import Box, Hosted, joined
 from .learning_rates import HOST_RATE, Pace
 
 
@@ -55,13 +55,10 @@ class NeuSGeometry(Hosted):
         pace: Pace = 1.0,
     ) -> None:
         super().__init__(field, scale=scale, bounds=bounds, half=1.01, learning_rate=learning_rate, pace=pace)
-        self._memo = PointMemo()
 
     def forward(self, x: Tensor) -> Tensor:
         """Distance and features at ``x`` ``(N, 3)`` → ``(N, 1 + F)``; without a graph they cost a value only."""
-        if not torch.is_grad_enabled():  # nor could the host ask for a gradient, which it takes by autograd
-            return self._value_features(x)
-        return self._memo.ask("value", x, self.field, lambda: self._evaluate(x))
+        return self._features(x)
 
     def sdf_hidden_appearance(self, x: Tensor) -> Tensor:
         """``forward`` under NeuS's other name."""
@@ -73,12 +70,11 @@ class NeuSGeometry(Hosted):
 
     def gradient(self, x: Tensor) -> Tensor:
         """Gradient at ``x`` ``(N, 3)`` → ``(N, 1, 3)``, with its graph; like NeuS, leaves ``x`` requiring gradients."""
-        gradient = self._memo.ask("gradient", x, self.field, lambda: self._evaluate(x))
-        return mark(x, gradient)
+        return self._gradient(x)
 
-    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        jet = self._jet(x)
-        return joined(jet), jet.gradient.unsqueeze(-2)
+    def _halves(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        output, gradient = super()._halves(x)
+        return output, gradient.unsqueeze(-2)
 
 
 class InstantNSRGeometry(Hosted):
@@ -226,7 +222,6 @@ class NerfstudioField(Hosted):
         self.color, self.heads = color, heads
         self.deviation_network = Deviation(deviation)
         self.cos_anneal_ratio = 1.0
-        self._memo = PointMemo()
 
     def set_cos_anneal_ratio(self, anneal: float) -> None:
         """Set ``cos_anneal`` of `neus_optical_depth`: 0 at the start of training, 1 after annealing."""
@@ -234,13 +229,11 @@ class NerfstudioField(Hosted):
 
     def forward_geonetwork(self, inputs: Tensor) -> Tensor:
         """Distance and features at ``inputs`` ``(..., 3)`` → ``(..., 1 + F)``; without a graph a value only."""
-        if not torch.is_grad_enabled():  # the host's exporters, which need the distance only
-            return self._value_features(inputs)
-        return self._memo.ask("value", inputs, self.field, lambda: self._evaluate(inputs))
+        return self._features(inputs)
 
     def gradient(self, x: Tensor) -> Tensor:
         """Gradient at ``x`` ``(..., 3)`` → ``(..., 3)``, with its graph; free after `forward_geonetwork`."""
-        return mark(x, self._memo.ask("gradient", x, self.field, lambda: self._evaluate(x)))
+        return self._gradient(x)
 
     def get_sdf(self, ray_samples: Any) -> Tensor:
         """Distance at the starts of the samples ``(R, S)`` → ``(R, S, 1)``; costs a value only."""
@@ -300,7 +293,3 @@ class NerfstudioField(Hosted):
         """See `Hosted.parameter_groups`; colours and deviation have ``lr`` itself."""
         others = [*self.color.parameters(), *self.deviation_network.parameters()]
         return [*super().parameter_groups(lr), {"params": others, "lr": lr}]
-
-    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        jet = self._jet(x)
-        return joined(jet), jet.gradient

@@ -190,9 +190,9 @@ def march(
             return
         value = field.value(rays.points(), level=level)
         if count == 1:
-            rays, value = _from_the_start(field, level, rays, value, rule)
-        if count <= 2:  # a ray that overshot is at its start now
-            rays, value = _from_the_front(field, level, rays, value)
+            rays, value = _sent_back(field, level, rays, value, rays.overshot(value, rule), rays.low)
+        if count <= 2:  # a ray that overshot is at its start now, and may begin earlier
+            rays, value = _sent_back(field, level, rays, value, rays.began_behind(value), rays.entry)
             rays = rays._replace(sign=torch.where(rays.is_fresh() & (value < 0), -1.0, rays.sign))
         if reach is not None:
             hits.record_near(rays, (value * rays.sign < reach) | (rays.sign < 0))
@@ -205,23 +205,14 @@ def march(
         rays = rays.only((~ended).nonzero()[:, 0])
 
 
-def _from_the_start(field: Field, level: int, rays: Rays, value: Tensor, rule: Rule) -> tuple[Rays, Tensor]:
-    """Send rays that overshot the surface back to their start; returns the rays and the values there."""
-    behind = rays.overshot(value, rule).nonzero()[:, 0]
-    if not len(behind):
+def _sent_back(field: Field, level: int, rays: Rays, value: Tensor, behind: Tensor, to: Tensor) -> tuple[Rays, Tensor]:
+    """Send the rays ``behind`` the surface back to depths before it; returns the rays and the values there."""
+    rows = behind.nonzero()[:, 0]
+    if not len(rows):
         return rays, value
-    rays = rays._replace(depth=rays.depth.index_copy(0, behind, rays.low[behind]))
-    return rays, value.index_copy(0, behind, field.value(rays.only(behind).points(), level=level))
-
-
-def _from_the_front(field: Field, level: int, rays: Rays, value: Tensor) -> tuple[Rays, Tensor]:
-    """Send rays whose start is behind the surface back to where they may begin; with the values there."""
-    behind = rays.began_behind(value).nonzero()[:, 0]
-    if not len(behind):
-        return rays, value
-    depth = rays.depth.index_copy(0, behind, rays.entry[behind])
-    rays = rays._replace(depth=depth, low=depth)
-    return rays, value.index_copy(0, behind, field.value(rays.only(behind).points(), level=level))
+    depth, low = (column.index_copy(0, rows, to[rows]) for column in (rays.depth, rays.low))
+    rays = rays._replace(depth=depth, low=low)
+    return rays, value.index_copy(0, rows, field.value(rays.only(rows).points(), level=level))
 
 
 class RayState(NamedTuple):

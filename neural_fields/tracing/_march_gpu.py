@@ -7,11 +7,12 @@ sees the values that it would see in `march`, but for rounding.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import torch
 from torch import Tensor
 
-from ..backend.fixed_shapes import first_rows, fixed_shapes
+from ..backend.fixed_shapes import FixedShapes, first_rows, fixed_shapes
 from ..fields.field import Field
 from ._march import PATIENCE, RayHits, Rays, RayState, Rule, step
 
@@ -55,27 +56,22 @@ class _Chunk:
 
     def run(self, passes: int, hits: RayHits, reach: float | None, capacity: Sequence[int]) -> list[Tensor]:
         """Do ``passes`` passes, record the rays that ended, and return the requested capacity of each band."""
-        requested: list[Tensor] = []
-        if self.field.same_rows:
-            with fixed_shapes(capacity) as shapes:
-                for _ in range(passes):
-                    there = shapes.mask = ~self.ended
-                    value = self._values()
-                    self._pass(value, there if shapes.overflow is None else there & ~shapes.overflow, hits, reach)
-            requested = shapes.requested
-        else:  # a field that is evaluated at other rows could not tell which rows overflow
+        # A field that is evaluated at other rows could not tell which rows overflow.
+        with fixed_shapes(capacity) if self.field.same_rows else nullcontext() as shapes:
             for _ in range(passes):
-                self._pass(self._values(), ~self.ended, hits, reach)
+                self._pass(shapes, hits, reach)
         state = self.state
         hits.record(self.rays.ray, state.hit, state.depth, state.level, self.count, state.slope)
-        return requested
+        return [] if shapes is None else shapes.requested
 
-    def _values(self) -> Tensor:
-        return self.field.value(self.rays.points(), level=self.level)
-
-    def _pass(self, value: Tensor, there: Tensor, hits: RayHits, reach: float | None) -> None:
-        """Let the rays that are ``there`` take in their values."""
-        rays = self.rays
+    def _pass(self, shapes: FixedShapes | None, hits: RayHits, reach: float | None) -> None:
+        """Let the rays under way, but for those that overflow, take in their values."""
+        rays, there = self.rays, ~self.ended
+        if shapes is not None:
+            shapes.mask = there
+        value = self.field.value(rays.points(), level=self.level)
+        if shapes is not None and shapes.overflow is not None:
+            there = there & ~shapes.overflow
         # A ray that is behind the surface at its first value goes back, and begins again.
         back = there & (self.count == 0) & rays.overshot(value, self.rule)
         early = there & (self.count <= 1) & ~back

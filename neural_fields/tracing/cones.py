@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,8 +19,6 @@ from .sphere import BOUNDING_RADIUS, ball_crossing, check_rays, unit_directions
 CONE_LIPSCHITZ = 1.15  # of networks, which are steeper than a distance in places; a cone too far loses thin parts
 TILES = (16, 4)  # sides in pixels, each a multiple of the next
 CONE_STEPS = 64  # most steps of a cone; rays do the rest
-
-Columns = tuple[Tensor, ...]
 
 
 @torch.no_grad()
@@ -89,50 +87,34 @@ def _march_cones(
 
         return march_cones(packed(network), (origin, axis, spread, leave, depth), delta, lipschitz, max_steps)
 
-    def advance(fixed: Columns, moving: Columns, on: Tensor) -> tuple[Columns, Tensor]:
-        (axis, sigma, leave), (depth, before, value_before) = fixed, moving
-        t = torch.where(on, depth, 0)  # those that have left are at infinity
-        value = field.value(origin + t[:, None] * axis, level=0)
-        # Behind the surface, the field was steeper than ``lipschitz``: step back, and leave it to the rays.
-        passed = value * value_before < 0
-        step = ((value.abs() - delta) / lipschitz - t * sigma) / (1 + sigma)
-        ahead = torch.where(passed, before, t + step.clamp(min=0))
-        # Once a step is shorter than the cone is wide, smaller cones get on better.
-        goes_on = (step > t * sigma) & (ahead < leave) & ~passed
-        return (torch.where(ahead >= leave, torch.inf, ahead), t, value), goes_on
-
-    moving = (depth, depth, torch.full_like(depth, torch.nan))
-    return _until_all_stop((axis, spread, leave), moving, depth.isfinite(), advance, max_steps)[0]
-
-
-def _until_all_stop(
-    fixed: Columns,
-    moving: Columns,
-    going: Tensor,
-    advance: Callable[[Columns, Columns, Tensor], tuple[Columns, Tensor]],
-    max_steps: int,
-) -> Columns:
-    """Advance the rows that are ``going`` ``(K,)`` until none is, at most ``max_steps`` times.
-
-    ``advance`` maps the ``fixed`` and ``moving`` columns ``(K, …)`` and the going to the next moving, and to which go
-    on. A CPU drops stopped rows after each step; an accelerator is read as rarely as in `_march_gpu`.
-    """
-    on_cpu, steps = not makes_wait(going.device), 0
+    # A CPU drops cones that have stopped after each step; an accelerator is read as rarely as in `_march_gpu`.
+    on_cpu, steps = not makes_wait(depth.device), 0
+    going, before, value = depth.isfinite(), depth, torch.full_like(depth, torch.nan)
     chunk, left = (1, int(going.sum())) if on_cpu else (FIRST_PASSES, len(going))
     while left and steps < max_steps:
         rows = going.nonzero()[:, 0] if on_cpu else first_rows(going, left)
         if left == len(going):
             rows = torch.arange(left, device=going.device)
-        here, part, on = tuple(column[rows] for column in fixed), tuple(column[rows] for column in moving), going[rows]
+        line, sigma, last, on = axis[rows], spread[rows], leave[rows], going[rows]
+        moving = (depth[rows], before[rows], value[rows])
         for _ in range(min(chunk, max_steps - steps)):
-            moved, goes_on = advance(here, part, on)
-            part = tuple(torch.where(on, new, old) for new, old in zip(moved, part, strict=True))
-            on = on & goes_on
-        moving = tuple(column.index_copy(0, rows, new) for column, new in zip(moving, part, strict=True))
+            t = torch.where(on, moving[0], 0)  # those that have left are at infinity
+            here = field.value(origin + t[:, None] * line, level=0)
+            # Behind the surface, the field was steeper than ``lipschitz``: step back, and leave it to the rays.
+            passed = here * moving[2] < 0
+            step = ((here.abs() - delta) / lipschitz - t * sigma) / (1 + sigma)
+            ahead = torch.where(passed, moving[1], t + step.clamp(min=0))
+            moved = (torch.where(ahead >= last, torch.inf, ahead), t, here)
+            moving = tuple(torch.where(on, new, old) for new, old in zip(moved, moving, strict=True))
+            # Once a step is shorter than the cone is wide, smaller cones get on better.
+            on = on & (step > t * sigma) & (ahead < last) & ~passed
+        depth, before, value = (
+            old.index_copy(0, rows, new) for old, new in zip((depth, before, value), moving, strict=True)
+        )
         going = going.index_copy(0, rows, on)
         steps, left = steps + chunk, int(on.sum())
         chunk = 1 if on_cpu else PASSES
-    return moving
+    return depth
 
 
 class _Cones(NamedTuple):

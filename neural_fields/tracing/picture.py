@@ -67,10 +67,8 @@ def make_rays(view, origin, directions, entries, ends, width, count, PIXELS: tl.
     entry, leave = _ball(ox, oy, oz, dx, dy, dz, tl.load(view + 20).to(tl.float32))
     tl.store(entries + pixel, tl.maximum(entry, 0.0), mask=real)
     tl.store(ends + pixel, leave, mask=real)
-    first = pixel == 0
-    tl.store(origin + pixel, ox, mask=first)
-    tl.store(origin + pixel + 1, oy, mask=first)
-    tl.store(origin + pixel + 2, oz, mask=first)
+    for axis in tl.static_range(3):
+        tl.store(origin + pixel + axis, tl.load(view + 13 + axis).to(tl.float32), mask=pixel == 0)
 
 
 @triton.jit
@@ -199,19 +197,14 @@ def see_hits(
         step = tl.where(trusted, -value / tl.where(trusted, slope, 1.0), 0.0)
         step = tl.minimum(tl.maximum(step, -reach), reach)
         tl.store(depths + row, tl.load(depths + row, mask=real, other=0.0) + step, mask=real)
-        x = tl.load(positions + row * 3, mask=real, other=0.0) + step * dx
-        y = tl.load(positions + row * 3 + 1, mask=real, other=0.0) + step * dy
-        z = tl.load(positions + row * 3 + 2, mask=real, other=0.0) + step * dz
-        tl.store(positions + row * 3, x, mask=real)
-        tl.store(positions + row * 3 + 1, y, mask=real)
-        tl.store(positions + row * 3 + 2, z, mask=real)
+        for axis in tl.static_range(3):
+            d = tl.load(directions + pixel * 3 + axis, mask=real, other=0.0)
+            place = tl.load(positions + row * 3 + axis, mask=real, other=0.0)
+            tl.store(positions + row * 3 + axis, place + step * d, mask=real)
     size = tl.maximum(size, 1e-12)
-    tl.store(normals + row * 3, gx / size, mask=real)
-    tl.store(normals + row * 3 + 1, gy / size, mask=real)
-    tl.store(normals + row * 3 + 2, gz / size, mask=real)
-    tl.store(sights + row * 3, dx, mask=real)
-    tl.store(sights + row * 3 + 1, dy, mask=real)
-    tl.store(sights + row * 3 + 2, dz, mask=real)
+    for axis in tl.static_range(3):
+        tl.store(normals + row * 3 + axis, tl.load(gradients + row * 3 + axis, mask=real) / size, mask=real)
+        tl.store(sights + row * 3 + axis, tl.load(directions + pixel * 3 + axis, mask=real), mask=real)
 
 
 class Setting(NamedTuple):

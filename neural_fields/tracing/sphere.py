@@ -189,15 +189,14 @@ def trace_expected(
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
     if expected is None and reach is None and choose_levels(levels_of(field)[: level + 1], directions, jet=False).fused:
         _march_fused(field, level, spans, hits, rule, max_steps)
-        unknown = Near(*(column.reshape(shape) for column in hits.near))
-        return _hits(hits, origins, directions, length), hits.slope.reshape(shape), unknown
-    rays = Rays.begin(*spans)
-    if expected is not None:
-        depth, slope, value = (part.to(directions).broadcast_to(shape) for part in expected)
-        flat = Expected((depth * length).reshape(-1), slope.reshape(-1), value.reshape(-1))
-        rays = rays.expecting(flat, rule)
-    go = march_ahead if makes_wait(directions.device) else march
-    go(field, level, rays, hits, rule, max_steps, reach)
+    else:
+        rays = Rays.begin(*spans)
+        if expected is not None:
+            depth, slope, value = (part.to(directions).broadcast_to(shape) for part in expected)
+            flat = Expected((depth * length).reshape(-1), slope.reshape(-1), value.reshape(-1))
+            rays = rays.expecting(flat, rule)
+        go = march_ahead if makes_wait(directions.device) else march
+        go(field, level, rays, hits, rule, max_steps, reach)
     clear, value, leave = (column.reshape(shape) for column in hits.near)
     near_surface = Near(clear / length, value, leave / length)
     return _hits(hits, origins, directions, length), hits.slope.reshape(shape), near_surface
@@ -239,18 +238,17 @@ def _begin(
     """
     origins, directions = torch.broadcast_tensors(origins, directions)
     shape = directions.shape[:-1]
-    starts, ends = ((_like(depth, directions).broadcast_to(shape) * length).reshape(-1) for depth in (near, far))
+    # Numbers are filled in on the device, without waiting.
+    depths = (
+        part.to(directions) if isinstance(part, Tensor) else directions.new_full((), part) for part in (near, far)
+    )
+    starts, ends = ((depth.broadcast_to(shape) * length).reshape(-1) for depth in depths)
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     entries = torch.zeros_like(starts)
     if radius is not None:
         entry, leave = ball_crossing(origins, directions, radius)
         entries, ends = entry.clamp(min=0), torch.minimum(ends, leave)
     return (origins, directions, entries, torch.maximum(starts, entries), ends), RayHits(starts)
-
-
-def _like(number: Tensor | float, other: Tensor) -> Tensor:
-    """A number on the device and in the dtype of ``other``, filled in there without waiting."""
-    return number.to(other) if isinstance(number, Tensor) else other.new_full((), number)
 
 
 def _hits(hits: RayHits, origins: Tensor, directions: Tensor, length: Tensor) -> Hits:
@@ -370,7 +368,16 @@ def map_attribute(
     """
     field = as_field(field)
     rows = field.check_points(points).reshape(-1, field.in_dim)
-    parts = [_map_rows(field, attribute, part, delta, level) for part in rows.split(batch)]
+    parts: list[tuple[Tensor, Tensor]] = []
+    for part in rows.split(batch):
+        reached = field.value(part, level=level).abs() < delta
+        away = (~reached).nonzero()[:, 0]
+        if len(away):
+            feet, arrived = project_to_surface(field, part[away], level=level)
+            part, reached = part.index_copy(0, away, feet), reached.index_copy(0, away, arrived)
+        kept = reached.nonzero()[:, 0]
+        found = attribute(part[kept])
+        parts.append((found.new_zeros(len(part), found.shape[-1]).index_copy(0, kept, found), reached))
     values, reached = (torch.cat(both) for both in zip(*parts, strict=True))
     return Mapped(values.reshape(*points.shape[:-1], values.shape[-1]), reached.reshape(points.shape[:-1]))
 
@@ -384,17 +391,3 @@ def map_colors(texture: TextureField, points: Tensor, *, batch: int = 1 << 18) -
         texture.geometry, texture.colors, points, delta=float(texture.delta), level=texture.geometry_level, batch=batch
     )
     return Mapped(torch.where(reached[..., None], values, texture.outside.to(values)), reached)
-
-
-def _map_rows(
-    field: Field, attribute: Callable[[Tensor], Tensor], rows: Tensor, delta: float, level: int
-) -> tuple[Tensor, Tensor]:
-    reached = field.value(rows, level=level).abs() < delta
-    away = (~reached).nonzero()[:, 0]
-    if len(away):
-        feet, arrived = project_to_surface(field, rows[away], level=level)
-        rows = rows.index_copy(0, away, feet)
-        reached = reached.index_copy(0, away, arrived)
-    kept = reached.nonzero()[:, 0]
-    found = attribute(rows[kept])
-    return found.new_zeros(len(rows), found.shape[-1]).index_copy(0, kept, found), reached

@@ -1,35 +1,30 @@
-"""``mplicits demo``: a scan in, a mesh and a picture of every level out, and how near the result is."""
+"""``mplicits demo``: a scan in, a mesh and a picture of every level out."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ...datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
-from ...datasets.synthetic.samples import feet_and_normals
+from ...datasets import Camera, PointCloud, orbit, read_cloud, statue_scan, write_cloud_ply
 from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.backend.files import check_place
 from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing.extract import Mesh, extract_mesh, surface_needed
-from ..fit.train import Run, fit
+from ..fit.train import fit
 from ..mesh.files import write_mesh
 from ..render.picture import Image, contact_sheet, write_picture
 from ..render.rasterise import picture_of
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import trace_view
 from ..surface.surface import from_cloud
-from ..training.progress import counted, format_table, progress_bars, reported
+from ..training.progress import counted, progress_bars, reported
 from ..training.settings import FitConfig
 from .common import tell_budget
-
-Float64 = NDArray[np.float64]
+from .fit import describe
 
 TILE = (480, 640)
 
@@ -37,10 +32,9 @@ TILE = (480, 640)
 def demo(
     cloud: str | Path | None, out: str | Path, *, config: FitConfig, up: str | None = None, resolution: int = 320
 ) -> int:
-    """Fit a cloud, write its meshes and a picture into ``out``, and print figures.
+    """Fit a cloud, or the bundled scan, write its mesh and a picture into ``out``, and print what `describe` says.
 
-    Without a cloud, the bundled scan is fitted and compared with its exact surface. ``up`` is "y" or "z". Raises an
-    InputError if the cloud cannot be used or ``out`` cannot be made.
+    ``up`` is "y" or "z". Raises an InputError if the cloud cannot be used or ``out`` cannot be made.
     """
     started = time.monotonic()
     out = Path(out)
@@ -50,7 +44,6 @@ def demo(
     asked_up, up = up, up or ("z" if cloud is None else "y")
     picture = out / "picture.png"
     drawn: list[tuple[str, Image]] = []  # what the picture shows side by side, with titles
-    said: list[str] = []  # once the bars are gone
     with progress_bars() as report:
         # Before anything is made.
         points = statue_scan(progress=counted(report, "scan")) if cloud is None else read_cloud(cloud)
@@ -58,7 +51,6 @@ def demo(
         file = out / "scan.ply" if cloud is None else Path(cloud)
         if cloud is None:
             write_cloud_ply(file, points)
-        said.append(f"{file}: {len(points):,} points")
 
         def show(field: Field, similarity: Similarity) -> None:
             """Draw the level that is finished beside those before, so that there is something to look at meanwhile."""
@@ -73,28 +65,20 @@ def demo(
 
         run = fit(file, config, out=out / "run", progress=report, level_done=show)
 
-        meshes, levels = [], run.field.num_levels
-        mesh_count = counted(report, "meshes")
-        for level in range(levels):
-            mesh_count(level, levels)
-            with surface_needed(f"level {level} has no surface; is the cloud a surface, are its normals?"):
-                meshes.append(extract_mesh(run.field, level=level, resolution=resolution))
-        finest = spread_colors(meshes[-1], points, run.similarity)
+        what = "the finest level has no surface; is the cloud a surface, are its normals?"
+        with reported(report, "mesh"), surface_needed(what):
+            finest = extract_mesh(run.field, resolution=resolution)
+        finest = spread_colors(finest, points, run.similarity)
         # The mesh in the scan's coordinates, and one for other programs: upright, in metres, at the origin.
         placement = Placement("z", "mm", center=True) if cloud is None else Placement(asked_up, center=True)
         for name in ("mesh.ply", "mesh.glb"):
             write_mesh(out / name, finest, run.similarity, placement if name == "mesh.glb" else None)
-        mesh_count(levels, levels)
         if finest.colors is not None:
             camera = view_of(from_cloud(points).moved(run.similarity), up)
             drawn.append((f"mesh: {len(finest.faces):,} faces", picture_of(finest, camera)))
             write_picture(picture, contact_sheet(drawn))
-        with reported(report, "figures"):
-            said.append(_figures(run, meshes, points))
-            if cloud is None:
-                said.append(_true_errors(points, run.field, run.similarity))
     tell_budget(run.record)
-    print("\n".join(said))
+    print(f"{file}: {len(points):,} points\n{describe(out / 'run')}")
     print(f"{out / 'mesh.ply'}, mesh.glb, picture.png, run/: {time.monotonic() - started:.0f} s in all")
     return 0
 
@@ -124,44 +108,3 @@ def _traced(field: Field, camera: Camera, level: int) -> Image:
     seen = trace_view(field, camera, level=level, device=field.deltas.device)
     light = ShadeOptions(shadows=True, occlusion=True)
     return compose(seen, shade(seen, "lambert", camera=camera, field=field, level=level, options=light))
-
-
-@torch.inference_mode()
-def distances_to_surface(field: Field, points: Float64, *, level: int) -> Float64:
-    """First-order distances |f| / |∇f| of ``points`` ``(N, 3)`` to the zero set of a level, in the field's units."""
-    parts = []
-    for part in torch.from_numpy(points.astype(np.float32)).split(1 << 18):
-        jet = field.jet(part, level=level)
-        parts.append(jet.value.abs() / jet.gradient.norm(dim=-1).clamp(min=1e-6))
-    return torch.cat(parts).double().numpy()
-
-
-def _figures(run: Run, meshes: Sequence[Mesh], cloud: PointCloud) -> str:
-    """Per level: what it cost, and how far the input points are from its surface."""
-    scale = run.similarity.scale
-    points = run.similarity.to_unit(from_cloud(cloud).vertices)
-    rows = []
-    for stage, mesh in zip(run.record["stages"], meshes, strict=True):
-        level = stage["level"]
-        away = distances_to_surface(run.field, points, level=level) * scale
-        delta = f"{float(run.field.deltas[level]) * scale:.4g}" if level < len(run.field.deltas) else "-"
-        seconds = stage["sampling_seconds"] + stage["training_seconds"]
-        figures = [f"{np.sqrt((away**2).mean()):.4g}", f"{np.median(away):.4g}", f"{len(mesh.faces):,}"]
-        rows.append([f"level {level}", f"{stage['parameters']:,}", f"{seconds:.0f} s", delta, *figures])
-    header = ["", "parameters", "training", "band δ", "points off: rms", "median", "faces"]
-    return f"lengths in input units\n{format_table(header, rows)}"
-
-
-def _true_errors(cloud: PointCloud, field: Field, similarity: Similarity) -> str:
-    """How far the scan and each level are from the statue itself, at the feet of the scan's points, in input units."""
-    scan = STATUE_PLACEMENT.to_unit(cloud.points)
-    feet = feet_and_normals(Statue(), scan)[0]
-    unit = similarity.to_unit(STATUE_PLACEMENT.to_input(feet))
-    away = {"the scan's points themselves": np.linalg.norm(scan - feet, axis=1) * STATUE_PLACEMENT.scale}
-    for level in range(field.num_levels):
-        away[f"level {level}, at the scan's points"] = distances_to_surface(field, unit, level=level) * similarity.scale
-    rows = [
-        [name, *(f"{figure:.3f}" for figure in (np.sqrt((far**2).mean()), *np.quantile(far, (0.5, 0.95))))]
-        for name, far in away.items()
-    ]
-    return format_table(["off the statue, mm", "rms", "median", "95 %"], rows)

@@ -160,19 +160,15 @@ def _slice_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "run", "--level")
     what = f"{', '.join(PICTURES)}; with {' or '.join(FILMS)} the plane sweeps through the shape"
     add_flags(parser, "--out", help=what)
-    direction = parser.add_mutually_exclusive_group()
-    direction.add_argument("--axis", choices=("x", "y", "z"), help="the plane is across this axis (z)")
-    vector: dict[str, Any] = {"type": finite, "nargs": 3}
-    seen = "or it is seen from this direction"
-    direction.add_argument("--normal", **vector, metavar=("NX", "NY", "NZ"), help=seen)
+    add("--axis", choices=("x", "y", "z"), help="the plane is across this axis (z)")
     what = "coordinate on the axis, or per cent of the shape's extent: 30%% (50%%)"
     add("--at", type=_place, metavar="C", help=what)
-    add("--point", **vector, metavar=("X", "Y", "Z"), help="with --normal: a point of the plane")
     add_flags(parser, "--up", help="the axis that points up in the picture (y)")
     add_flags(parser, "--size", type=whole(64, 8192), help="width, or width and height (800)")
     add("--iso", dest="lines", type=whole(2, 400), metavar="N", help="about so many iso-lines fit (40)")
     add_flags(parser, "--zoom", help="magnification (1: the whole shape)")
-    add("--center", **vector, metavar=("X", "Y", "Z"), help="what to zoom in on (default: the middle)")
+    what = "what to zoom in on (default: the middle)"
+    add("--center", type=finite, nargs=3, metavar=("X", "Y", "Z"), help=what)
     add("--no-bands", dest="bands", action="store_false", help="leave out the bands |f_i| < δ_i")
     add_flags(parser, "--frames", help="of a film (96)")
     add_flags(parser, "--fps")
@@ -182,14 +178,7 @@ def _slice(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (*PICTURES, *FILMS))
     film = arguments.out.suffix.lower() in FILMS
     if film:
-        why = "a film goes through the whole shape; leave it out, or write a picture (.png)"
-        refuse(arguments, ("at", "point"), why)
-    if arguments.normal is None:
-        refuse(arguments, ["point"], "goes with --normal; with --axis say --at C")
-    else:
-        refuse(arguments, ["at"], "is a place on an axis; with --normal say --point X Y Z")
-    if arguments.normal is not None and not any(arguments.normal):
-        raise input_error("--normal: has no direction; give three numbers that are not all 0")
+        refuse(arguments, ["at"], "a film goes through the whole shape; leave it out, or write a picture (.png)")
     arguments.size = _pair(arguments.size)
 
     from ..render.slicing import SliceOptions, slice_run
@@ -209,17 +198,12 @@ SLICE = Command(
     """  mplicits slice runs/scan -o slice.png
   mplicits slice runs/scan -o side.png --axis x --at 40%
   mplicits slice runs/scan -o detail.png --at 0.1 --zoom 8 --center 0.35 0.45 0
-  mplicits slice runs/scan -o oblique.png --normal 1 0 1 --point 0 0.2 0
   mplicits slice runs/scan -o sweep.mp4 --axis y --frames 120""",
     _slice_arguments,
     _slice,
     "Draw a plane through a field: sign and distance as colour, iso-lines, the surface of every level, and the bands "
     "in which the levels are evaluated. Coordinates are those of the input.",
 )
-
-
-MOVING = (*FILMS, ".png")
-ANIMATED_SHADINGS = ("lambert", "headlight", "normals", "color")
 
 
 def _animate_arguments(parser: argparse.ArgumentParser) -> None:
@@ -240,12 +224,13 @@ def _animate_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--up", of="film, and a .glb, which is turned y-up: ")
     add_flags(parser, "--azimuth", "--elevation", "--samples", of="film: ")
     add_flags(parser, "--zoom", help="film: magnification of the middle (1)")
-    add("--shading", choices=ANIMATED_SHADINGS, help="film: how it is shaded (lambert)")
+    shadings = ("lambert", "headlight", "normals", "color")
+    add("--shading", choices=shadings, help="film: how it is shaded (lambert)")
     add("--shadows", action="store_true", help="film: shadows and occlusion, for twice the time or more")
 
 
 def _animate(arguments: argparse.Namespace) -> int:
-    film = arguments.out.suffix.lower() in MOVING
+    film = arguments.out.suffix.lower() in (*FILMS, ".png")
     if film:
         refuse(arguments, ["resolution"], "goes with meshes; a film is traced in pixels (--size)")
     else:
@@ -288,13 +273,8 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--up", default="y")
     add("--cloud", metavar="FILE", help="a cloud beside the field (default: what the run was fitted to)")
     add("--host", default="127.0.0.1", help="address to listen on (127.0.0.1: this machine only)")
-    add("--port", type=_port, metavar="N", help="port to listen on (default: a free one from 8080 up)")
+    add("--port", type=whole(1, 65535), metavar="N", help="port to listen on (default: a free one from 8080 up)")
     add("--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser")
-
-
-def _port(text: str) -> int | None:
-    """A port; 0 and "auto" let us choose."""
-    return None if text in ("0", "auto") else whole(0, 65535)(text)
 
 
 def _view(arguments: argparse.Namespace) -> int:

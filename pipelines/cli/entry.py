@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ..training.settings import FitConfig, command_line, given_flags, input_error
-from .common import Command, Program, add_flags, add_settings, between, check_output, read_settings, refuse
+from .common import Command, Program, add_flags, add_settings, between, check_output, read_settings
 from .draw import ANIMATE, RENDER, SLICE, VIEW
 from .fit import FIT, describe
 from .mesh import BOOLEAN, EVALUATE, MESH, OFFSET
@@ -38,8 +38,6 @@ examples:
 `mplicits COMMAND --help` says more about each; `mplicits --version` prints the version."""
 
 
-SOLIDS = ("box", "cylinder", "gear")
-SAMPLES = ("statue", *SOLIDS)
 LENGTHS = {  # faults of a scan that are lengths, and what each is
     "noise": "standard deviation of the ranges, along the rays (0.096)",
     "isotropic_noise": "standard deviation of each coordinate of each point (0)",
@@ -67,10 +65,9 @@ def _doctor(_arguments: argparse.Namespace) -> int:
 
 
 def _sample_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", nargs="?", choices=SAMPLES, default=SAMPLES[0], help="which one (default: statue)")
     add_flags(parser, "--out", help="a .ply file to write")
     add_flags(parser, "--seed", help="of the scanners' noise (0)")
-    faults = parser.add_argument_group("faults of the statue's scan; lengths in mm, or with a unit: 0.2mm, 20um")
+    faults = parser.add_argument_group("faults of the scan; lengths in mm, or with a unit: 0.2mm, 20um")
     for name, about in LENGTHS.items():
         faults.add_argument(f"--{name.replace('_', '-')}", metavar="LENGTH", help=about)
     what = "share of the readings beside a jump in depth that lie in the air between its two sides, from 0 to 1 (0)"
@@ -81,11 +78,8 @@ def _sample_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _sample(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".ply",))
-    flags = (*LENGTHS, "smear", "uneven")
-    if arguments.name in SOLIDS:
-        refuse(arguments, flags, f"is of scans, and {arguments.name} is an exact mesh; leave it out")
-        return _solid(arguments)
-    options = _faults(arguments) if any(getattr(arguments, name) is not None for name in flags) else {}
+    given = any(getattr(arguments, name) is not None for name in (*LENGTHS, "smear", "uneven"))
+    options = _faults(arguments) if given else {}
     from ...datasets import statue_scan, write_cloud_ply
     from ..training.progress import counter_bar
 
@@ -111,17 +105,6 @@ def _faults(arguments: argparse.Namespace) -> dict[str, Any]:
             given[name.removesuffix("_noise")] = length / STATUE_PLACEMENT.scale
     noise = {"noise": given.pop("noise")} if "noise" in given else {}
     return {**noise, "faults": ScanFaults(**{**given_flags(arguments, ScanFaults), **given})}
-
-
-def _solid(arguments: argparse.Namespace) -> int:
-    from ...datasets.synthetic.prisms import PRISMS
-    from ...neural_fields import Mesh
-    from ..mesh.files import write_mesh
-
-    write_mesh(arguments.out, Mesh(*PRISMS[arguments.name]()))
-    command = f"python -m benchmarks fit {arguments.out} --points 12000"
-    print(f"{arguments.out}: an exact mesh; in a checkout of mplicits, `{command}` fits points drawn on it")
-    return 0
 
 
 def _demo_arguments(parser: argparse.ArgumentParser) -> None:
@@ -169,9 +152,8 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             "check this installation and measure this machine", "  mplicits doctor", lambda _parser: None, _doctor
         ),
         "sample": Command(
-            "write the bundled scan of a statue, or the mesh of a solid with sharp edges",
-            "  mplicits sample -o scan.ply\n  mplicits sample -o worse.ply --noise 0.5mm --misalign 1mm --smear 0.3\n"
-            "  mplicits sample gear -o gear.ply",
+            "write the bundled scan of a statue",
+            "  mplicits sample -o scan.ply\n  mplicits sample -o worse.ply --noise 0.5mm --misalign 1mm --smear 0.3",
             _sample_arguments,
             _sample,
         ),

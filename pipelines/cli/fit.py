@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ...neural_fields import Mesh
     from ..fit.depth import DepthInput
     from ..fit.many import FitOutcome
-    from ..mesh.finish import FitMesh
 
 DEPTH_FLAGS = (
     *("intrinsics", "fov", "color", "resize_color", "poses"),
@@ -58,10 +57,6 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     what = "show the growing field in the browser, checkpoint by checkpoint"
     add("--watch", action="store_true", help=what)
     add_settings(parser, FitConfig)
-    _depth_arguments(parser)
-
-
-def _depth_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("depth maps (PNG, TIFF, NPY or NPZ, or a folder of them)").add_argument
     what = "camera JSON (ours, or Open3D's), or four numbers in pixels: FX FY CX CY"
     add("--intrinsics", nargs="+", metavar="FILE|NUMBER", help=what)
@@ -102,11 +97,21 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
     if not fitted:
         check_new_run(directory, resume=arguments.resume, force=arguments.force)
     columns = read_record(directory)["config"].get("columns") if config is None else config.columns
-    mesh = _planned(arguments, Path(cloud) if depth is None else depth, columns)
+    mesh = None
+    if arguments.mesh is not None:
+        from ..mesh.finish import plan_mesh
+
+        options = {"columns": columns, "colors": not arguments.no_colors, "resume": arguments.resume}
+        mesh = plan_mesh(arguments.mesh, directory, Path(cloud) if depth is None else depth, **options)
     then = () if mesh is None else ("--mesh", mesh.out, *["--no-colors"] * arguments.no_colors)
     again = f"to continue: {command_line('fit', cloud, '-o', directory, '--resume', *then)}"
     texture, made, said, started = None, None, list[str](), time.monotonic()
-    with _watched(arguments), training(again, quiet=arguments.quiet, board=arguments.tensorboard) as report:
+    watch: AbstractContextManager[object] = nullcontext()
+    if arguments.watch:
+        from ..web.watch import Watcher
+
+        watch = Watcher(directory, resume=arguments.resume, say=lambda line: print(line, file=sys.stderr))
+    with watch, training(again, quiet=arguments.quiet, board=arguments.tensorboard) as report:
         if not fitted and depth is None:
             fit(cloud, config, out=directory, resume=arguments.resume, progress=report)
         elif not fitted and depth is not None:
@@ -134,25 +139,6 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
     facts += ["with colours"] * mesh.colored + ([" ".join(trim)] if trim else [])
     print(f"{mesh.out}: {', '.join(facts)}, {time.monotonic() - started:.1f} s in all")
     return 0
-
-
-def _watched(arguments: argparse.Namespace) -> AbstractContextManager[object]:
-    """Show the run in the browser while it is trained, with ``--watch``."""
-    if not arguments.watch:
-        return nullcontext()
-    from ..web.watch import Watcher
-
-    return Watcher(arguments.out, resume=arguments.resume, say=lambda line: print(line, file=sys.stderr))
-
-
-def _planned(arguments: argparse.Namespace, source: Path | DepthInput, columns: str | None) -> FitMesh | None:
-    """The mesh that shall follow, checked; None if there is to be none."""
-    if arguments.mesh is None:
-        return None
-    from ..mesh.finish import plan_mesh
-
-    options = {"colors": not arguments.no_colors, "resume": arguments.resume}
-    return plan_mesh(arguments.mesh, arguments.out, source, columns=columns, **options)
 
 
 def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
@@ -241,13 +227,10 @@ def _depth_input(arguments: argparse.Namespace, cloud: str) -> DepthInput | None
     from ...datasets.files import DEPTH_SUFFIXES
     from ..fit.depth import DepthInput
 
-    given = [
-        name for name in DEPTH_FLAGS if getattr(arguments, name) is not None and getattr(arguments, name) is not False
-    ]
-    path = Path(cloud)
-    if given and not (path.suffix.lower() in DEPTH_SUFFIXES or path.is_dir()):
-        flag, known = given[0].replace("_", "-"), ", ".join(DEPTH_SUFFIXES)
-        raise input_error(f"{path}: --{flag} is for depth maps ({known}, or a folder of them), not for clouds")
+    path, given = Path(cloud), any(getattr(arguments, name) not in (None, False) for name in DEPTH_FLAGS)
+    if not (path.suffix.lower() in DEPTH_SUFFIXES or path.is_dir()):
+        known = ", ".join(DEPTH_SUFFIXES)
+        refuse(arguments, DEPTH_FLAGS, f"is for depth maps ({known}, or a folder of them); {path} is none")
     inside = path.is_dir() and any(is_depth_file(file) for file in path.iterdir())
     if not given and not inside and not (path.suffix and is_depth_file(path)):
         return None
@@ -364,6 +347,7 @@ def _describe_level(level: Any, stage: dict[str, Any]) -> str:
 
 def _describe_record(record: dict[str, Any], path: Path) -> Rows:
     from ...datasets import CleaningReport
+    from ..training.folder import resumes_with
 
     if not record:
         return []
@@ -376,10 +360,17 @@ def _describe_record(record: dict[str, Any], path: Path) -> Rows:
     if cleaning:
         known = {name: cleaning[name] for name in CleaningReport.__dataclass_fields__ if name in cleaning}
         rows.append(("points", CleaningReport(**known).summary()))
-    signs = record.get("signs")
-    if signs:
-        rows.append(("signs", _describe_signs(signs, cleaning.get("kept", 0))))
-    rows.append(("state", _describe_state(record, path)))
+    if signs := record.get("signs"):
+        what = "found no inside: normals keep their estimated signs"
+        if signs["clear"]:
+            what = f"turned {signs['turned_normals']:,} of {cleaning.get('kept', 0):,} normals"
+        what += f" (slope along them {signs['slope']:.2f})"
+        rows.append(("signs", f"level 0, trained without orientation, {what}"))
+    state = "finished" if record.get("finished") else "unfinished"
+    if not record.get("finished") and path.is_dir():
+        again = resumes_with(path, record)
+        state += f": {again}" if again else ", with nothing to resume from: begin again with --force"
+    rows.append(("state", state))
     texture = record.get("texture")
     if texture and not texture.get("finished", True):
         rows.append(("texture", f"unfinished: {command_line('texture', path, texture['source'], '--resume')}"))
@@ -392,26 +383,6 @@ def _describe_record(record: dict[str, Any], path: Path) -> Rows:
     if "seed" in record.get("config", {}):
         rows.append(("seed", str(record["config"]["seed"])))
     return rows
-
-
-def _describe_state(record: dict[str, Any], path: Path) -> str:
-    """Whether the training is finished, and what to type if not."""
-    if record.get("finished"):
-        return "finished"
-    from ..training.folder import resumes_with
-
-    if not path.is_dir():
-        return "unfinished"
-    again = resumes_with(path, record)
-    return f"unfinished: {again}" if again else "unfinished, with nothing to resume from: begin again with --force"
-
-
-def _describe_signs(signs: dict[str, Any], count: int) -> str:
-    if signs["clear"]:
-        what = f"level 0, trained without orientation, turned {signs['turned_normals']:,} of {count:,} normals"
-    else:
-        what = "level 0, trained without orientation, found no inside: normals keep their estimated signs"
-    return f"{what} (slope along them {signs['slope']:.2f})"
 
 
 def _describe_surface(surface: Mesh, reading: str) -> Rows:

@@ -9,8 +9,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from ...neural_fields.backend.errors import InputError
-from ..training.settings import given_flags
+from ..training.settings import given_flags, input_error
 from .common import Command, add_flags, positive, whole, write_json
 
 if TYPE_CHECKING:
@@ -61,7 +60,7 @@ def _mesh(arguments: argparse.Namespace) -> int:
     if arguments.format is not None:
         return _scene(arguments, started)
     if arguments.crs is not None:
-        raise InputError("--crs: goes with --format 3dtiles")
+        raise input_error("--crs: goes with --format 3dtiles")
     options = MeshOptions(**given_flags(arguments, MeshOptions))
     if arguments.json and options.report is None and options.texture is None:
         options = dataclasses.replace(options, report=True)
@@ -84,7 +83,7 @@ def _scene(arguments: argparse.Namespace, started: float) -> int:
     plain = MeshOptions()
     for name, value in given_flags(arguments, MeshOptions).items():
         if name not in given and value != getattr(plain, name):
-            raise InputError(f"--{name.replace('_', '-')}: does not go with --format 3dtiles; leave it out")
+            raise input_error(f"--{name.replace('_', '-')}: does not go with --format 3dtiles; leave it out")
     with progress_bars(counting=True) as report:
         scene = scene_of_run(arguments.run, arguments.out, SceneOptions(**given), say=print, report=report)
     print(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -206,9 +207,6 @@ RECONSTRUCT = Command(
 )
 
 
-CONFIG_SUFFIXES = (".yaml", ".yml")
-
-
 def _evolve_arguments(parser: argparse.ArgumentParser) -> None:
     what = (
         "runs or .safetensors files of `mplicits fit`, clouds or meshes, which are fitted first, exact shapes such as "
@@ -251,7 +249,7 @@ def _evolve_settings(arguments: argparse.Namespace) -> EvolveConfig:
     if arguments.resume:
         return new_settings(arguments, EvolveConfig, "inputs") or EvolveConfig()
     inputs = arguments.inputs
-    if inputs and inputs[0].lower().endswith(CONFIG_SUFFIXES):
+    if inputs and inputs[0].lower().endswith((".yaml", ".yml")):
         if len(inputs) > 1 or preset:
             raise input_error(f"{inputs[0]}: holds all settings; leave out other inputs, --preset and --config")
         preset, inputs = Path(inputs[0]), []
@@ -279,7 +277,8 @@ def _tell_evolution(record: dict[str, Any]) -> None:
         print(f"  t = {end['time']:g}, {end['name']}: mean |f| {end['mean_value']:.1e}, {far}")
     frames, slopes = checks["frames"], checks["slopes"]
     counts, volumes = ([frame[name] for frame in frames] for name in ("components", "volume"))
-    print(f"  {len(frames)} frames: volume {min(volumes):.3g} to {max(volumes):.3g}, components {_runs(counts)}")
+    runs = " → ".join(str(count) for count, _ in groupby(counts))  # such as 2 → 1 → 3
+    print(f"  {len(frames)} frames: volume {min(volumes):.3g} to {max(volumes):.3g}, components {runs}")
     for change in checks["changes"]:
         before, after = (Topology(**change[side]) for side in ("before", "after"))
         print(f"  t = {change['time']:.3f}: {before} → {after}")
@@ -287,12 +286,6 @@ def _tell_evolution(record: dict[str, Any]) -> None:
         print(f"  |∇f| {slopes['mean']:.3f}, from {slopes['low']:.3f} to {slopes['high']:.3f} at nine of ten points")
     for line in checks["warnings"]:
         print(f"warning: {line}")
-
-
-def _runs(counts: list[int]) -> str:
-    """``2 → 1 → 3``: the numbers, repetitions left out."""
-    kept = [count for index, count in enumerate(counts) if index == 0 or count != counts[index - 1]]
-    return " → ".join(map(str, kept))
 
 
 EVOLVE = Command(

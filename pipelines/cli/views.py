@@ -49,12 +49,19 @@ def _find(arguments: argparse.Namespace, photos: str, find: Callable[..., Found]
 
 def tell_found(found: Found) -> None:
     """Print what was found, and warn on stderr."""
-    from ..reconstruct.check import said_of
+    from ..reconstruct.hull import named
 
-    line, warnings = said_of(found)
-    print(line)
-    for warning in warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+    how = f"{found.points:,} points that {found.photographs} photographs show"
+    if found.left_out is not None:
+        placed = found.photographs - len(found.left_out)
+        how = f"{placed} of {found.photographs} photographs placed by {found.points:,} points that are"
+    print(f"{found.project}: {how}{',' * (found.left_out is None)} seen {found.error:.2f} pixels off")
+    if found.left_out:
+        what = f"not placed: {named(found.left_out)}; too little in them is in others too, or they are blurred"
+        print(f"warning: {what}", file=sys.stderr)
+    if found.points < 100:
+        what = f"{found.points} points are few: cameras may be wrong; see `mplicits check-cameras`"
+        print(f"warning: {what}", file=sys.stderr)
 
 
 FIND_CAMERAS = Command(

@@ -16,7 +16,7 @@ from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing.extract import Mesh
 from ..surface.raster import cover
 from .atlas import decimate, to_frame, unwrap
-from .files import check_textured_path, write_textured
+from .files import write_textured
 
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -109,8 +109,6 @@ def textured_mesh(
     decimated mesh, near the surface. ``size`` is the side of the textures in texels, ``faces`` the triangles to keep.
     Raises InputError.
     """
-    path = check_textured_path(path, similarity)
-    check_texture_size(size)
     unwrapped = unwrap(*decimate(mesh.vertices, mesh.faces, faces), size=size)
     color, normal = bake(unwrapped, colors_at, normals_at, size=size)
     write_textured(path, unwrapped, similarity, color=color, normal=normal, placement=placement)

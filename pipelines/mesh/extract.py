@@ -42,23 +42,17 @@ class Fineness(NamedTuple):
     missed: float
 
 
-def thin_depth(resolution: int) -> float:
-    """The thickness √3 h up to which a part is thin for cells of side h, in unit-sphere lengths.
-
-    A plate as thick as one cell has a corner inside on each line along the axis nearest to its normal; the diagonal
-    leaves room for bars and errors. The mesher's box has a side of 2.04.
-    """
-    return 3**0.5 * 2.04 / resolution
-
-
 @torch.no_grad()
 def thin_share(field: Field, points: NDArray[np.floating], resolution: int, *, level: int = -1) -> float:
-    """The share of points ``(N, 3)`` on parts thinner than √3 cells.
+    """The share of points ``(N, 3)`` on parts thinner than √3 cells; the mesher's box has a side of 2.04.
+
+    A plate as thick as one cell has a corner inside on each line along the axis nearest to its normal; the diagonal
+    leaves room for bars and errors.
 
     Each point is moved onto the surface by x = p − f n / |∇f|, n = ∇f / |∇f|. With d of √3 cells, its part is thin if
     x − n d / 4 is inside and x − n d outside; a point whose x − n d / 4 is outside was not on the surface.
     """
-    depth = thin_depth(resolution)
+    depth = 3**0.5 * 2.04 / resolution
     asked = torch.from_numpy(np.asarray(points[:: 1 + len(points) // 20_000], np.float32))
     places = upload(asked, field.like.device)
     jet = field.jet(places, level=level)
@@ -71,13 +65,12 @@ def thin_share(field: Field, points: NDArray[np.floating], resolution: int, *, l
 
 def fineness(field: Field, points: NDArray[np.floating], *, level: int = -1) -> Fineness:
     """The resolution at which hardly any points ``(N, 3)`` lie on parts too thin for it; else the last one."""
-    missed = thin_share(field, points, RESOLUTIONS[0], level=level)
+    first, *finer, last = RESOLUTIONS
+    missed = thin_share(field, points, first, level=level)
     if missed <= THIN_SHARE:
-        return Fineness(RESOLUTIONS[0], missed)
-    for resolution in RESOLUTIONS[1:-1]:
-        if thin_share(field, points, resolution, level=level) <= THIN_SHARE:
-            return Fineness(resolution, missed)
-    return Fineness(RESOLUTIONS[-1], missed)
+        return Fineness(first, missed)
+    fit = (each for each in finer if thin_share(field, points, each, level=level) <= THIN_SHARE)
+    return Fineness(next(fit, last), missed)
 
 
 @dataclass(frozen=True)
@@ -154,7 +147,7 @@ def export_run(
         InputError: there is no such run or level, it has no surface, the file cannot be written or is the run's cloud,
             or an option does not go with another.
     """
-    options = options or MeshOptions()
+    options, say = options or MeshOptions(), say or (lambda _: None)
     check = check_mesh_path if options.texture is None else check_textured_path
     check(out)
     placement = placement_of(options.up, options.unit, options.center)
@@ -203,12 +196,11 @@ def export_run(
     if options.faces is not None:
         mesh, decimation = decimated(mesh, options.faces, unit=similarity.scale)
         mesh = dataclasses.replace(mesh, normals=_unit_normals(field, mesh, level=normal_level))
-        if say is not None:
-            say(decimation.describe(options.unit or "input units"))
+        say(decimation.describe(options.unit or "input units"))
     colored = options.colors and file.with_name(TEXTURE_FILE).is_file()
     colors = colors_of_run(file, field, options.time) if colored else None
     line = placement.describe(Path(out).suffix)
-    if line is not None and say is not None:
+    if line is not None:
         say(f"coordinates: {line}")
     if options.texture is not None:
         mapped = field.num_levels - 1 if options.normal_level is None else normal_level
@@ -227,10 +219,9 @@ def export_run(
 
 
 def chosen_resolution(
-    field: Field, asked: int | None, support: Support | None, level: int, say: Callable[[str], None] | None
+    field: Field, asked: int | None, support: Support | None, level: int, say: Callable[[str], None]
 ) -> int:
     """Cells per side; ``say`` is called with a warning if parts are too thin for them."""
-    say = say or (lambda _: None)
     if support is None or support.visible:
         return asked or RESOLUTIONS[0]
     if asked is None:
@@ -250,14 +241,14 @@ def chosen_resolution(
     return asked
 
 
-def _visible(mesh: Mesh, support: Support, say: Callable[[str], None] | None, *, cut: bool) -> Mesh:
+def _visible(mesh: Mesh, support: Support, say: Callable[[str], None], *, cut: bool) -> Mesh:
     """The part of a mesh that is visible in the photographs, with ``cut``; ``say`` is called if much is not."""
     part, missed = visible_part(mesh, support)
     if not cut or part is None:
-        if say is not None and missed > 0.05:
+        if missed > 0.05:
             say(f"{missed:.0%} of the surface is visible in fewer than two photographs; --seen leaves it out")
         return mesh
-    if say is not None and missed > 0:
+    if missed > 0:
         say(f"left out {missed:.2g} of the area, which is visible in fewer than two photographs")
     return part
 

@@ -20,8 +20,6 @@ from ..training.settings import TextureConfig
 from .extract import MeshOptions, mesh_run
 from .files import check_mesh_path
 
-COLORLESS = ".stl"
-
 
 @dataclass(frozen=True)
 class FitMesh:
@@ -78,7 +76,7 @@ def plan_mesh(
     check_mesh_path(out)
     if out.absolute().resolve() == cloud.absolute().resolve():
         raise InputError(f"--mesh {out}: is the cloud that is fitted; name another file")
-    colors = colors and out.suffix.lower() != COLORLESS
+    colors = colors and out.suffix.lower() != ".stl"  # which has none
     if depth and not resume:
         return FitMesh(out, run, cloud, colors and source.color is not None, trim=True)
     points = read_cloud(kept_cloud(run) if depth else cloud, columns=columns).points

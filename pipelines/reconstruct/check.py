@@ -19,7 +19,6 @@ from ...datasets.cameras import Camera
 from ...datasets.clouds.cleaning.orientation import fibonacci_directions
 from ...datasets.views.formats.shots import DepthMap, DepthSource
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
-from ...datasets.views.poses.colmap_process import Found
 from ...datasets.views.poses.colmap_process import Report as ColmapReport
 from ...neural_fields import InputError, Similarity
 from ..mesh.files import write_mesh
@@ -41,19 +40,6 @@ class DepthCheck:
     # share, in the median view, in whose place another view sees further; None: no two maps can be compared
     seen_through: float | None = None
     warnings: tuple[str, ...] = ()  # one line each
-
-    def in_words(self, views: int) -> str:
-        """One line, for a data set of ``views`` photographs."""
-        words = [f"depth maps: {self.maps} of {views} photographs have one"]
-        if self.inside is not None:
-            words.append(f"{self.inside:.1%} of the readings end in the region")
-        if self.seen_through is not None:
-            words.append(f"other views see through {self.seen_through:.1%} of them")
-        return "; ".join(words)
-
-    def record(self) -> dict[str, Any]:
-        """As numbers, for JSON."""
-        return {"maps": self.maps, "share_inside": self.inside, "share_seen_through": self.seen_through}
 
 
 def check_depths(images: PosedImages) -> DepthCheck | None:
@@ -122,9 +108,6 @@ def _seen_through(
     return through / told if told >= 50 else None
 
 
-Bool = NDArray[np.bool_]
-
-
 @dataclass(frozen=True)
 class CameraLimits:
     """What is warned of. The values are this project's own, from data sets with and without faults."""
@@ -157,13 +140,16 @@ class CameraCheck:
 
     def record(self) -> dict[str, Any]:
         """As numbers and lists, for JSON."""
+        maps = None
+        if (depths := self.depths) is not None:
+            maps = {"maps": depths.maps, "share_inside": depths.inside, "share_seen_through": depths.seen_through}
         return {
             "fields_of_view_degrees": self.fields_of_view.tolist(),
             "distances_in_radii": self.distances.tolist(),
             "share_of_sphere_in_view": self.in_view.tolist(),
             "share_of_sparse_points_inside": self.points_inside,
             "share_of_masks_inside": self.mask_inside,
-            "depth_maps": None if self.depths is None else self.depths.record(),
+            "depth_maps": maps,
             "warnings": list(self.warnings),
         }
 
@@ -268,8 +254,13 @@ def format_check(images: PosedImages, check: CameraCheck, sizes: Sequence[tuple[
         lines.append(f"sparse points: {len(images.points):,}, {100 * check.points_inside:.0f} % of them in the region")
     if check.mask_inside is not None:
         lines.append(f"masks: {100 * check.mask_inside:.1f} % of the object's pixels see into the region")
-    if check.depths is not None:
-        lines.append(check.depths.in_words(len(images.views)))
+    if (depths := check.depths) is not None:
+        words = [f"depth maps: {depths.maps} of {len(images.views)} photographs have one"]
+        if depths.inside is not None:
+            words.append(f"{depths.inside:.1%} of the readings end in the region")
+        if depths.seen_through is not None:
+            words.append(f"other views see through {depths.seen_through:.1%} of them")
+        lines.append("; ".join(words))
     return "\n".join(lines)
 
 
@@ -287,7 +278,7 @@ def _field_of_view(camera: Camera) -> tuple[float, float]:
     return across, down
 
 
-def _placement(eyes: Float64, forward: Float64, middle: Bool) -> Iterator[str]:
+def _placement(eyes: Float64, forward: Float64, middle: NDArray[np.bool_]) -> Iterator[str]:
     """Warnings about where cameras stand and look."""
     count, distance = len(eyes), np.linalg.norm(eyes, axis=1)
     if count == 1:
@@ -396,19 +387,3 @@ def _brightness(view: PosedImage) -> float:
 def colmap_report(report: Report | None) -> ColmapReport:
     """A receiver of COLMAP's progress that passes it on to ``report``."""
     return lambda stage, done, total: counted(report or silent, stage)(done, total)
-
-
-def said_of(found: Found) -> tuple[str, list[str]]:
-    """What was found, in a line, and what is to be warned of."""
-    seen, warnings = f"seen {found.error:.2f} pixels off", []
-    if found.left_out is not None:
-        placed = found.photographs - len(found.left_out)
-        line = f"{placed} of {found.photographs} photographs placed by {found.points:,} points that are {seen}"
-        if found.left_out:
-            names = named(found.left_out)
-            warnings.append(f"not placed: {names}; too little in them is in others too, or they are blurred")
-    else:
-        line = f"{found.points:,} points that {found.photographs} photographs show, {seen}"
-    if found.points < 100:
-        warnings.append(f"{found.points} points are few: cameras may be wrong; see `mplicits check-cameras`")
-    return f"{found.project}: {line}", warnings

@@ -206,8 +206,11 @@ def _gathered(views: Sequence[PosedImage], images: PosedImages, random: np.rando
     for index, view in enumerate(views):
         camera = view.camera.moved(images.similarity)
         eye, axes = camera.eye.numpy(), camera.world_from_camera[:3, :3].numpy()
-        seen = (_observed(images, place[id(view)]) - eye) @ axes
-        seen = seen[seen[:, 2] > 0]
+        seen = np.empty((0, 3))  # sparse points that the view saw, in its camera's axes
+        if images.points is not None and images.observations is not None:
+            rows = images.observations[images.observations[:, 0] == place[id(view)], 1]
+            seen = (images.similarity.to_unit(images.points[rows]) - eye) @ axes
+            seen = seen[seen[:, 2] > 0]
         points = _Part(seen / seen[:, 2:], seen[:, 2], AS_IT_IS, exact=True, view=index)
         parts.append(_on_object(view, points))
         if view.depth is None:
@@ -223,13 +226,6 @@ def _gathered(views: Sequence[PosedImage], images: PosedImages, random: np.rando
     if in_region:
         _check_units(source, in_region, ratios)
     return [part for part in parts if len(part.numbers)]
-
-
-def _observed(images: PosedImages, view: int) -> Float64:
-    """The sparse points ``(N, 3)`` that a view saw, in unit-sphere coordinates."""
-    if images.points is None or images.observations is None:
-        return np.empty((0, 3))
-    return images.similarity.to_unit(images.points[images.observations[images.observations[:, 0] == view, 1]])
 
 
 def _of_map(depth: DepthMap, points: _Part, images: PosedImages, random: np.random.Generator, most: int) -> _Part:

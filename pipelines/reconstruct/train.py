@@ -20,7 +20,7 @@ from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import Field, InputError, Jet, NoSurfaceError, TextureField, extract_mesh
 from ...neural_fields.backend.devices import choose_device
 from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
-from ..render.picture import Image, picture_bytes, write_picture
+from ..render.picture import Image, picture_bytes
 from ..surface.surface import in_region, sample_points, thinned
 from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
 from ..training.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
@@ -48,17 +48,13 @@ from .views import (
 )
 
 HELD_OUT_FILE = "held_out.png"
-PREVIEW_FILE = "preview.png"
 MESH_FILE = "mesh.ply"  # that the command makes of a finished run
 
 
 @dataclass(frozen=True)
 class FinishOptions:
-    """Pictures on the way, the texture, and what of a time budget is kept for the end."""
+    """Held-out views, the texture, and what of a time budget is kept for the end."""
 
-    previews: int = 5  # pictures of the first view on the way
-    # of each; through fog, which a scene is at first, a pixel costs as much as one in training
-    preview_pixels: int = 4096
     sheet_views: int = 4  # rows of the sheet of held-out views
     texture_resolution: int = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
     texture_samples: int = 100_000  # points on it
@@ -131,7 +127,7 @@ def reconstruct(
             images = read_posed_images(images, width=config.width, depths=depths, allow_missing=config.allow_missing)
     load_compiler()
     training = _Reconstruction(images, config, folder, progress or silent, budget, resume=resume)
-    with folder.writing(HELD_OUT_FILE, PREVIEW_FILE, MESH_FILE):
+    with folder.writing(HELD_OUT_FILE, MESH_FILE):
         if resume:
             training.restore()
         return training.run()
@@ -180,7 +176,6 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         if self.measured is not None:
             inputs += [self.measured.along, self.measured.numbers]
         self.fingerprint = digest_of(tensor.cpu().numpy() for tensor in inputs)
-        self.shown = 0
         self.reserved = 0.0  # seconds of the time budget for the surface, which comes after the training
 
     def training_seconds(self) -> float | None:
@@ -213,7 +208,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
     def _pixel_seconds(self) -> float:
         """Seconds for a pixel of a held-out view, at the finest level, from a small picture."""
         started, small = time.monotonic(), reduced(self.test_views[0], FINISH.timed_pixels)
-        self._image(small, level=-1)
+        self._image(small)
         return (time.monotonic() - started) / _pixels(small)
 
     def surface_seconds(self) -> float:
@@ -232,19 +227,14 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         """The cameras that were trained on, in unit-sphere coordinates, and their masks."""
         return [(view.camera.moved(self.similarity), view.mask_bytes) for view in self.train_views]
 
-    @property
-    def level(self) -> int:
-        """The finest level that is switched on by now."""
-        return self.trainer.objective.level_at(self.trainer.fraction)
-
     def run(self) -> Reconstruction:
         """Train to the end, measure, colour, write."""
         with stop_on_signals() as flag:
             self.trainer.seconds = self.training_seconds()
-            if not self.take_steps(self.trainer, flag, lambda: self.model.geometry, self._report):
+            if not self.take_steps(self.trainer, flag, lambda: self.model.geometry, self.report):
                 raise Interrupted(self.folder.out)
             # What was trained is safe before pictures and texture are made, which may be interrupted or fail too.
-            self._save()
+            self.save(self.model.geometry, self.trainer)
         self.model.requires_grad_(False)
         return self._finish()
 
@@ -266,28 +256,17 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         self.folder.keep(RADIANCE_FILE, content)
         if pairs:
             self.folder.keep(HELD_OUT_FILE, picture_bytes(self._sheet(pairs[: FINISH.sheet_views])))
-        record = self.folder.finish(self.model.geometry, self.images.similarity, record, gone=(PREVIEW_FILE,))
+        record = self.folder.finish(self.model.geometry, self.images.similarity, record)
         model, images = self.model.cpu(), self.images
         return Reconstruction(model.geometry, images.similarity, out, record, model, texture, images)
-
-    def _report(self, progress: Progress) -> None:
-        self.report(progress)
-        done = progress.fraction
-        if self.folder.out is not None and done * (FINISH.previews + 1) >= self.shown + 1 and done < 1:
-            self.shown = int(done * (FINISH.previews + 1))
-            view = reduced((self.test_views or self.train_views)[0], FINISH.preview_pixels)
-            if not self.folder.has_checkpoint:  # or the picture would lie beside the run that was there
-                self._save()
-            write_picture(self.folder.out / PREVIEW_FILE, self._sheet([(view, self._image(view))]))
 
     def _sheet(self, pairs: Sequence[tuple[PosedImage, ViewImage]]) -> Image:
         return comparison_sheet(pairs, self.model.background)
 
-    def _image(self, view: PosedImage, *, level: int | None = None) -> ViewImage:
-        """A view as the levels up to ``level`` show it; None: those that are switched on by now."""
-        objective, level = self.trainer.objective, self.level if level is None else level
-        camera = view.camera.moved(self.similarity)
-        image = render_camera(self.model, camera, objective.sampling, level=level, sdf_grid=objective.grid)
+    def _image(self, view: PosedImage) -> ViewImage:
+        """A view as all levels show it."""
+        objective, camera = self.trainer.objective, view.camera.moved(self.similarity)
+        image = render_camera(self.model, camera, objective.sampling, sdf_grid=objective.grid)
         # The exposure of a view that is not trained on is unknown.
         return image if self.model.exposures is None else exposed_as(image, view, self.model.background)
 
@@ -335,19 +314,16 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
             raise Interrupted(self.folder.out)
         return fitted.texture, fitted.record
 
-    def _save(self) -> None:
-        self.save(self.model.geometry, self.trainer)
-
     def kept(self) -> dict[str, Any]:
         """See `Training.kept`."""
-        return {"shown": self.shown, "losses": self.trainer.losses, "start": self.start}
+        return {"losses": self.trainer.losses, "start": self.start}
 
     def restore(self) -> None:
         """Take up an interrupted run."""
         mismatch = f"{self.images.source}: not the pictures that {self.folder.path} was trained on; resume with those"
         _, progress = self.restored(mismatch)
         self.start = progress.get("start", self.start)
-        self.shown, self.trainer.losses = progress["shown"], progress["losses"]
+        self.trainer.losses = progress["losses"]
 
     def _by_view(self, names: tuple[str, str], found: tuple[Tensor, Tensor]) -> dict[str, dict[str, list[float]]]:
         """What was learnt of each photograph, three numbers each."""

@@ -20,7 +20,6 @@ from .picture import Image, write_picture
 from .slice import draw_slice, plane_axes, round_step, take_slice
 
 Float64 = NDArray[np.float64]
-Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -32,8 +31,6 @@ class SliceOptions:
         axis: the plane is across this one, "x", "y" or "z".
         at: place on that axis; None is the middle of the shape.
         percent: place on that axis instead, from 0 where the shape begins to 100 where it ends.
-        normal: of a plane across no axis, instead; it points to the viewer.
-        point: a point of that plane; None is the middle of the shape.
         up: "y" or "z", the axis that points up in the picture.
         size: width and height of the picture, without its legend.
         lines: about how many iso-lines fit between bottom and top.
@@ -44,13 +41,11 @@ class SliceOptions:
     axis: str = "z"
     at: float | None = None
     percent: float | None = None
-    normal: Triple | None = None
-    point: Triple | None = None
     up: str = "y"
     size: tuple[int, int] = (800, 800)
     lines: int = 40
     zoom: float = 1.0
-    center: Triple | None = None
+    center: tuple[float, float, float] | None = None
     bands: bool = True
     frames: int = 96
     fps: float = 24.0
@@ -91,9 +86,8 @@ class _View:
 
     def __init__(self, file: Path, field: Field, similarity: Similarity, level: int, options: SliceOptions) -> None:
         self.field, self.similarity, self.level, self.options = field, similarity, level, options
-        self.normal = np.eye(3)["xyz".index(options.axis)] if options.normal is None else np.array(options.normal)
+        self.normal = np.eye(3)["xyz".index(options.axis)]
         self.u, self.v = plane_axes(self.normal, up=options.up)
-        self.normal = self.normal / np.linalg.norm(self.normal)
         with surface_needed(f"{file}: no surface to slice"):
             shape = extract_mesh(field, resolution=64, level=level).vertices
         axes = np.stack((self.u, self.v, self.normal), axis=1)
@@ -113,18 +107,15 @@ class _View:
     def offset(self) -> float:
         """Place of the plane along the normal; raises an InputError if it misses the unit sphere."""
         options = self.options
-        offset, flag = self.middle, "--at"
-        if options.normal is not None and options.point is not None:
-            offset, flag = float(self.similarity.to_unit(np.array(options.point)) @ self.normal), "--point"
-        elif options.normal is None and options.percent is not None:
+        offset = self.middle
+        if options.percent is not None:
             offset = self.begin + (self.end - self.begin) * options.percent / 100
-        elif options.normal is None and options.at is not None:
+        elif options.at is not None:
             offset = float((self.similarity.to_unit(np.full(3, options.at)) * self.normal).sum())
         if not abs(offset) <= 1:
-            along = f"along {options.axis}" if options.normal is None else "along the normal"
             begin, end = (self.position(place) for place in (self.begin, self.end))
             raise InputError(
-                f"{flag}: the plane misses the shape, which reaches from {begin:.6g} to {end:.6g} {along} "
+                f"--at: the plane misses the shape, which reaches from {begin:.6g} to {end:.6g} along {options.axis} "
                 "(coordinates of the input)"
             )
         return offset
@@ -138,7 +129,7 @@ class _View:
         extent = (self.end - self.begin) * self.similarity.scale
         digits = max(0, 3 - math.floor(math.log10(extent))) if extent > 0 else 3
         place = f"{self.position(offset):.{digits}f}".replace("-", "−")
-        return f"{self.options.axis if self.options.normal is None else 'n·x'} = {place}"
+        return f"{self.options.axis} = {place}"
 
     def draw(self, offset: float) -> Image:
         """The picture of the plane at ``offset``, with its legend."""

@@ -438,11 +438,6 @@ class RunFolder:
                 self._gone = {SUPPORT_FILE, CLOUD_FILE, *also}
             yield
 
-    @property
-    def has_checkpoint(self) -> bool:
-        """Whether what lies in the directory is of this run."""
-        return self.resume or not self._gone
-
     def keep(self, name: str, content: bytes) -> None:
         """Have a file in the directory from the next checkpoint on."""
         if self.path is not None:
@@ -466,13 +461,11 @@ class RunFolder:
             self.keep(STATE_FILE, state_bytes(tensors, about))
             self._replace(self.path, field, similarity, record)
 
-    def finish(
-        self, field: Field, similarity: Similarity, record: Mapping[str, Any], *, gone: Iterable[str] = ()
-    ) -> dict[str, Any]:
-        """Write field and record of a finished run → the record; what was to be resumed, and ``gone``, go."""
+    def finish(self, field: Field, similarity: Similarity, record: Mapping[str, Any]) -> dict[str, Any]:
+        """Write field and record of a finished run → the record; what was to be resumed goes."""
         if self.path is None:
             return dict(record)
-        self._gone |= {STATE_FILE, *gone}
+        self._gone |= {STATE_FILE}
         return self._replace(self.path, field, similarity, record)
 
     def _replace(self, out: Path, field: Field, similarity: Similarity, record: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import secrets
 import socket
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from socketserver import ThreadingTCPServer
@@ -35,7 +36,7 @@ HEADERS = {
 }
 
 
-class PageServer:
+class PageServer(AbstractContextManager["PageServer"]):
     """Serves what ``pack`` makes until it is closed, as a context manager; only under the secret path of its `url`.
 
     It listens at the address ``host``, on the ``port`` or on the first free one from 8080 upwards. ``keep`` is called
@@ -83,9 +84,6 @@ class PageServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
-
-    def __enter__(self) -> PageServer:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -18,8 +18,6 @@ from ..render.rasterise import read_painted
 from ..render.shade import COLOR_MAPS, apply_color_map
 from .payload import Payload
 
-Float64 = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Shape:

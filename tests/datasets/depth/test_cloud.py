@@ -432,7 +432,7 @@ def test_intrinsics_as_numbers_or_an_angle(scene, tmp_path):
         ("depth/000.png --intrinsics camera.json --color small.png", "--resize-color"),
         ("small.png --intrinsics camera.json --color color", "3 pictures, but 1 depth maps"),
         ("small.npy --intrinsics camera.json", "the intrinsics are for 96 × 72"),
-        ("ball.xyz --max-depth 3", "--max-depth is for depth maps"),
+        ("ball.xyz --max-depth 3", "--max-depth: is for depth maps"),
     ],
 )
 def test_mistakes_of_the_command_line(scene, tmp_path, capsys, monkeypatch, words, message):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from mplicits.neural_fields import Box, Similarity, Sphere, Union, save_field
 from mplicits.pipelines.mesh import MeshOptions, export_run, extract
-from mplicits.pipelines.mesh.extract import RESOLUTIONS, fineness, thin_depth, thin_share
+from mplicits.pipelines.mesh.extract import RESOLUTIONS, fineness, thin_share
 from mplicits.pipelines.surface.surface import Support
 
-DEPTHS = {resolution: thin_depth(resolution) for resolution in RESOLUTIONS}
+DEPTHS = {resolution: 3**0.5 * 2.04 / resolution for resolution in RESOLUTIONS}  # of √3 cells
 
 
 def sides(thickness: float, count: int = 500) -> np.ndarray:

@@ -25,7 +25,7 @@ from mplicits.pipelines.reconstruct.train import reconstruct, surface_colors
 from mplicits.pipelines.surface.measure import chamfer
 from mplicits.pipelines.training.folder import load_state, read_record, state_bytes
 from mplicits.pipelines.training.settings import ReconstructConfig, load_config
-from mplicits.pipelines.training.trainer import Interrupted, Progress
+from mplicits.pipelines.training.trainer import Interrupted
 from reconstructions import TINY_SCENE, painted_sphere, small_reconstructions, with_views, without
 from safetensors.torch import load_file
 from torch import Tensor
@@ -140,18 +140,6 @@ def test_measured_depths_are_used_as_soon_as_there_are_any(tmp_path: Path, capsy
     assert main(f"{command} --force --depth-scale 1000 --depth-kind relative".split()) == 0
     assert main(f"{command} --force --depth-weight 0".split()) == 0
     assert "measured_depths" not in read_record(run)
-
-
-def test_pictures_on_the_way(data: Path, tmp_path: Path) -> None:
-    def report(progress: Progress) -> None:
-        if progress.stage == "held-out views":
-            assert (tmp_path / "preview.png").exists()
-            seen.append(progress)
-
-    seen: list[Progress] = []
-    reconstruct(data, replace(TINY, texture_steps=0), out=tmp_path, progress=report)
-    assert [progress.step for progress in seen] == [0, 1, 2]
-    assert not (tmp_path / "preview.png").exists()
 
 
 @pytest.mark.parametrize(("stage", "step"), [("reconstruct", 20), ("held-out views", 1)])
