@@ -241,9 +241,10 @@ def _solid_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _solid(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".ply",))
-    from mplicits.datasets.synthetic.prisms import PRISMS
     from mplicits.neural_fields import Mesh
     from mplicits.pipelines.mesh import write_mesh
+
+    from ..shapes.prisms import PRISMS
 
     write_mesh(arguments.out, Mesh(*PRISMS[arguments.name]()))
     command = f"python -m benchmarks fit {arguments.out} --points 12000"

@@ -9,13 +9,13 @@ import pytest
 import torch
 from benches import SMALL
 from mplicits.datasets import read_cloud
-from mplicits.datasets.synthetic.prisms import PRISMS
 from mplicits.neural_fields import Mesh, MultiscaleSDF, Sphere, Union, extract_mesh
 from mplicits.pipelines.surface.surface import components, face_normals
 
 from benchmarks.harness.report import as_text
 from benchmarks.shapes import fits as module
 from benchmarks.shapes.fits import STEEPEST, FitBench, facing_camera
+from benchmarks.shapes.prisms import PRISMS
 
 
 @pytest.mark.slow

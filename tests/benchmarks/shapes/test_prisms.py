@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from mplicits.datasets.synthetic.prisms import PRISMS, TURN, box, cylinder, gear
 
 from benchmarks.cli.shapes import SOLIDS
+from benchmarks.shapes.prisms import PRISMS, TURN, box, cylinder, gear
 
 
 def volume(solid: tuple[np.ndarray, np.ndarray]) -> float:
