@@ -16,13 +16,6 @@ from .mesh import Mesh
 
 Place = tuple[int, int, int]
 
-_COLUMNS = (
-    ((3,), np.int64),
-    ((), np.float32),
-    ((), np.int64),
-    ((3,), np.float64),
-    ((3,), np.float32),
-)  # of a `_Border`
 _AROUND = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), -1).reshape(27, 3)
 
 
@@ -50,6 +43,18 @@ class _Border(NamedTuple):
     edges: Ints
     vertices: NDArray[np.float64]
     normals: NDArray[np.floating]
+
+    @classmethod
+    def joined(cls, borders: list[_Border]) -> _Border:
+        """What all of them know."""
+        rows = np.empty((0, 3), np.float32)
+        return cls(
+            np.concatenate([rows.astype(np.int64), *(border.points for border in borders)]),
+            np.concatenate([rows[:, 0], *(border.values for border in borders)]),
+            np.concatenate([rows[:, 0].astype(np.int64), *(border.edges for border in borders)]),
+            np.concatenate([rows.astype(np.float64), *(border.vertices for border in borders)]),
+            np.concatenate([rows, *(border.normals for border in borders)]),
+        )
 
 
 def extract_parts(
@@ -137,7 +142,8 @@ def extract_parts(
 
 def _inside(points: Ints, box: Lattice) -> NDArray[np.bool_]:
     """Which points ``(N, 3)`` of the whole lattice lie in a part of it, or on its sides."""
-    return ((points >= box.first) & (points <= np.add(box.first, box.shape))).all(axis=1)
+    first = np.array(box.first)
+    return np.all((points >= first) & (points <= first + box.shape), axis=1)
 
 
 def _ends(edges: Ints, size: NDArray[np.int64]) -> tuple[Ints, Ints]:
@@ -163,8 +169,7 @@ def _part(
     """
     lattice = sampler.lattice
     first, shape = np.array(lattice.first), np.array(lattice.shape)
-    none = _Border(*(np.empty((0, *columns), kind) for columns, kind in _COLUMNS))
-    points, values, edges, places, directions = (np.concatenate(each) for each in zip(none, *known, strict=True))
+    points, values, edges, places, directions = _Border.joined(known)
     within = _inside(points, lattice)
     edges, chosen = np.unique(edges, return_index=True)
     starts, stops = _ends(edges, size)

@@ -183,16 +183,18 @@ class Verdict(NamedTuple):
 
     @property
     def better(self) -> bool:
-        """Whether the level is kept: one error is significantly less and the loss is less, or the level `learns`.
+        """Whether the level is kept: one error is significantly less, the other not significantly more, or it `learns`.
 
-        The loss weighs distance and angle as the training does. Either may grow where the surface comes nearer: the
-        distance to points that smoothing has rounded off, the angle to normals of vertices, which are means of those of
-        faces. Estimated normals share the noise of the points: with them the distance may not be significantly more.
-        The noise of points that were set apart is independent of the level: |f| there falls where the surface comes
-        nearer to the truth, often by less than its standard error. So a level is kept unless it rises significantly,
-        with its last weights: the best of several looks would fall by chance.
+        Either may grow where the surface comes nearer: the distance to points that smoothing has rounded off, the angle
+        to normals of vertices, which are means of those of faces. If it does significantly, the loss has to be less,
+        which weighs both as the training does. Estimated normals share the noise of the points: with them the distance
+        may not be significantly more, and the loss says nothing. The noise of points that were set apart is independent
+        of the level: |f| there falls where the surface comes nearer to the truth, often by less than its standard
+        error. So a level is kept unless it rises significantly, with its last weights: the best of several looks would
+        fall by chance.
         """
-        sound = self.fall.distance > -JUDGE.surely if self.guessed else self.after.loss < self.before.loss
+        sound = (self.fall.distance if self.guessed else min(self.fall)) > -JUDGE.surely
+        sound |= not self.guessed and self.after.loss < self.before.loss
         return sound if self.noisy else ((max(self.fall) > JUDGE.surely and sound) or self.learns)
 
     @property

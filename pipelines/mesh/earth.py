@@ -54,6 +54,7 @@ def on_globe(crs: str, origin: tuple[float, float, float]) -> Stand:
     """
     try:
         import pyproj
+        from pyproj.exceptions import ProjError
     except ImportError as error:
         raise InputError("--crs: places on the globe need pyproj; pip install 'mplicits[las]'") from error
     try:
@@ -62,7 +63,7 @@ def on_globe(crs: str, origin: tuple[float, float, float]) -> Stand:
         geocentric, geographic = (
             pyproj.Transformer.from_crs(system, f"EPSG:{number}", always_xy=True) for number in (4978, 4979)
         )
-    except pyproj.exceptions.ProjError as error:
+    except ProjError as error:
         raise InputError(f"--crs {crs[:80]}: is no coordinate system that pyproj knows; try EPSG:NUMBER") from error
 
     if not system.is_projected:
@@ -86,4 +87,6 @@ def on_globe(crs: str, origin: tuple[float, float, float]) -> Stand:
 
     slope = (points(origin + np.eye(3)) - points(origin - np.eye(3))).T / 2  # ∂scene / ∂input, constant over metres
     metres = float(np.cbrt(abs(np.linalg.det(slope))))
-    return Stand(points, np.linalg.inv(slope).T, metres, transform, f"on the globe, by {system.name}")
+    return Stand(
+        points, np.linalg.inv(slope).T.astype(np.float64), metres, transform, f"on the globe, by {system.name}"
+    )

@@ -141,7 +141,7 @@ def scene_of_run(
                     bounds=bounds,
                     progress=lambda _, done, total, show=show: show(done, total),
                 ):
-                    _keep(folder, part.place, part.mesh, shared=part.shared, edges=part.edges)
+                    _keep(folder, part.place, part.mesh, part.shared, part.edges)
             if support is not None and not support.visible and not options.keep_unsupported:
                 _drop_unsupported(folder, support)
         writer = _Writer(partial, stand, similarity, colors, counted(report or silent, "writing tiles"))
@@ -195,9 +195,10 @@ def _path(folder: Path, place: Place) -> Path:
     return folder / f"{'_'.join(map(str, place))}.npz"
 
 
-def _keep(folder: Path, place: Place, mesh: Mesh, **more: NDArray[Any]) -> None:
+def _keep(folder: Path, place: Place, mesh: Mesh, shared: NDArray[Any], edges: NDArray[Any]) -> None:
     assert mesh.normals is not None
-    np.savez(_path(folder, place), vertices=mesh.vertices, faces=mesh.faces, normals=mesh.normals, **more)
+    arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "shared": shared, "edges": edges}
+    np.savez(_path(folder, place), allow_pickle=False, **arrays)
 
 
 def _kept(path: Path) -> tuple[Mesh, NDArray[Any], NDArray[Any]]:
@@ -230,7 +231,10 @@ def _drop_unsupported(folder: Path, support: Support) -> None:
     met = edge[order][1:] == edge[order][:-1]
     graph = coo_array((np.ones(met.sum(), np.int8), (owner[:-1][met], owner[1:][met])), shape=(total, total))
     whole = connected_components(graph, directed=False)[1]
-    sums = Footing(*(np.bincount(whole, np.concatenate(each)) for each in zip(*found, strict=True)))
+    area, near, points = (
+        np.bincount(whole, np.concatenate(each)).astype(np.float64) for each in zip(*found, strict=True)
+    )
+    sums = Footing(area, near, points)
     stands = sums.stands(spacing_of(support.points))
     if not stands.any():
         return
@@ -241,7 +245,7 @@ def _drop_unsupported(folder: Path, support: Support) -> None:
         elif not kept.all():
             x, y, z = map(int, path.stem.split("_"))
             nothing = np.empty(0, np.int64)
-            _keep(folder, (x, y, z), keep_faces(_kept(path)[0], kept), shared=nothing, edges=nothing)
+            _keep(folder, (x, y, z), keep_faces(_kept(path)[0], kept), nothing, nothing)
 
 
 class _Writer:

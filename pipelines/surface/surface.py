@@ -227,8 +227,11 @@ def footing(mesh: Mesh, number: NDArray[np.integer], tree: KDTree, reach: float)
     around = ((tree.data >= corners.min(axis=0) - reach) & (tree.data <= corners.max(axis=0) + reach)).all(axis=1)
     near, whose = KDTree(corners).query(tree.data[around], distance_upper_bound=reach, workers=-1)
     own = of_vertex[used[np.asarray(whose)[np.isfinite(near)]]]
-    weights = (areas, areas * share)
-    return Footing(*(np.bincount(number, each, count) for each in weights), np.bincount(own, minlength=count) * 1.0)
+    area, near_area, points = (
+        np.bincount(which, weights, count).astype(np.float64)
+        for which, weights in ((number, areas), (number, areas * share), (own, np.ones(len(own))))
+    )
+    return Footing(area, near_area, points)
 
 
 def without_blobs(
