@@ -41,6 +41,7 @@ SCENE_FILE = "tileset.json"
 SEEN = 10_000  # points of each mesh at which errors are measured: of the Armadillo, 50,000 find the same
 TILES = "tiles"  # folder of the GLB files
 PARTS = "parts"  # folder of the meshes, while a scene is written
+NOTHING = np.empty(0, np.int64)  # shared with other parts
 _CUBE = list(itertools.product((0, 1), repeat=3))
 
 
@@ -116,9 +117,10 @@ def scene_of_run(
         raise InputError(f"{out}: holds something that is no 3D Tiles scene; name another folder")
     file = find_field(run)
     field, similarity, metadata = load_still(file, options.time)
+    record = metadata.get("run", {})
     level = chosen_level(field, file, options.level)
-    support = None if options.time is not None else read_support(file, metadata.get("run", {}), level)
-    stand = _stand(options, placement, similarity, metadata.get("run", {}), file)
+    support = None if options.time is not None else read_support(file, record, level)
+    stand = _stand(options, placement, similarity, record, file)
     say(f"coordinates: {stand.line}")
     resolution = chosen_resolution(field, options.resolution, support, level, say)
     bounds, cells, steps = _lattice(support, resolution, options.cells)
@@ -141,12 +143,16 @@ def scene_of_run(
                     bounds=bounds,
                     progress=lambda _, done, total, show=show: show(done, total),
                 ):
-                    _keep(folder, part.place, part.mesh, part.shared, part.edges)
+                    if "region" not in record:
+                        _keep(folder, part.place, part.mesh, part.shared, part.edges)
+                    elif (inside := ((part.mesh.vertices**2).sum(axis=1) <= 1)[part.mesh.faces].all(axis=1)).any():
+                        _keep(folder, part.place, keep_faces(part.mesh, inside), NOTHING, NOTHING)
             if support is not None and not support.visible and not options.keep_unsupported:
                 _drop_unsupported(folder, support)
         writer = _Writer(partial, stand, similarity, colors, counted(report or silent, "writing tiles"))
         root = writer.tile(steps - 1, (0, 0, 0))
-        assert root is not None
+        if root is None:
+            raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
         extent = float(np.linalg.norm(root.high - root.low))
         root.entry["transform"] = stand.transform.T.ravel().tolist()  # column by column
         root.entry["refine"] = "REPLACE"
@@ -244,8 +250,7 @@ def _drop_unsupported(folder: Path, support: Support) -> None:
             path.unlink()
         elif not kept.all():
             x, y, z = map(int, path.stem.split("_"))
-            nothing = np.empty(0, np.int64)
-            _keep(folder, (x, y, z), keep_faces(_kept(path)[0], kept), nothing, nothing)
+            _keep(folder, (x, y, z), keep_faces(_kept(path)[0], kept), NOTHING, NOTHING)
 
 
 class _Writer:

@@ -126,6 +126,19 @@ def test_a_plate_that_coarse_cells_miss(tmp_path):
     assert any("content" in tile for tile in entries(root))
 
 
+def test_of_a_reconstruction_the_region_of_interest_alone_is_written(tmp_path):
+    run, out, about = tmp_path / "field.safetensors", tmp_path / "scene", {"run": {"region": "the unit sphere"}}
+    beyond = Sphere(center=(0.85, 0.85, 0.0), radius=0.15)
+    save_field(run, Union(Sphere(radius=0.4), beyond), metadata=about)
+    scene_of_run(run, out, SceneOptions(resolution=64, cells=32))
+    root = json.loads((out / "tileset.json").read_text())["root"]
+    for tile in entries(root):
+        assert np.linalg.norm(content_of(out, tile).vertices, axis=1).max() < 0.41
+    save_field(run, beyond, metadata=about)
+    with pytest.raises(InputError, match="region"):
+        scene_of_run(run, tmp_path / "none", SceneOptions(resolution=64, cells=32))
+
+
 def test_units_and_axes_without_a_system(run, tmp_path):
     out = tmp_path / "scene"
     scene_of_run(run, out, SceneOptions(resolution=32, cells=32, up="y", unit="mm"))
