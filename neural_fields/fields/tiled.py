@@ -26,7 +26,6 @@ from .field import Field, Jet, solid
 from .similarity import Similarity
 
 SLOPE = 3 / 4  # largest derivative of σ
-PLANES = 3  # most planes within whose blend a point lies, one of each axis, as tiles are wider than two blends
 
 
 class Split(NamedTuple):
@@ -125,9 +124,12 @@ class TiledField(Gated):
         return False
 
     def slope_bound(self, slope: float) -> float:
-        """See `Field.slope_bound`: ½ gap Σ|∇w_i| is added, and a plane adds 2 · ¾ / h to the sum."""
+        """See `Field.slope_bound`: ½ gap Σ|∇w_i| is added, and a plane adds 2 · ¾ / h to the sum.
+
+        A point lies within the blend of one plane of each axis at most, as tiles are wider than two blends.
+        """
         widest = max((SLOPE / split.half for split in self.splits), default=0.0)
-        return slope + PLANES * widest * self.gap
+        return slope + len({split.axis for split in self.splits}) * widest * self.gap
 
     def tile(self, number: int) -> Tile:
         """A tile, on the device and in the precision of this field; the one not used for longest is dropped."""
