@@ -285,19 +285,19 @@ class _Writer:
             highs.append(placed.vertices.max(axis=0))
             entry["content"] = {"uri": self._write(step, place, placed)}
         low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+        middle, half = (low + high) / 2, (high - low) / 2
+        volume = {"boundingVolume": {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]}}
         error = 0.0
-        if children:
-            finer = [
-                _kept(each)[0] for each in (_path(self.out / PARTS / str(step - 1), p) for p in below) if each.is_file()
-            ]
-            apart = float(np.linalg.norm(high - low))  # where there is nothing coarse, all may be missed
+        if step:
+            files = [_path(self.out / PARTS / str(step - 1), each) for each in below]
+            finer = [_kept(file)[0] for file in files if file.is_file()]
+            apart = float(np.linalg.norm(high - low))  # if only one of the two has a surface
             if mesh is not None and finer:
                 apart = deviation(_joined(finer), mesh, probes=SEEN)[0] * self.similarity.scale * self.stand.metres
-            error = apart + max(tile.error for tile in children)
-            entry["children"] = [tile.entry for tile in children]
-        middle, half = (low + high) / 2, (high - low) / 2
-        box = [*middle.tolist(), *np.diag(half).ravel().tolist()]
-        return _Tile({"boundingVolume": {"box": box}, "geometricError": error} | entry, low, high, error)
+            error = apart + max((tile.error for tile in children), default=0.0)
+            # A surface at the side of a cube may be in its neighbour at the next step: nothing is there in its place.
+            entry["children"] = [tile.entry for tile in children] or [volume | {"geometricError": 0.0}]
+        return _Tile(volume | {"geometricError": error} | entry, low, high, error)
 
     def _placed(self, mesh: Mesh) -> Mesh:
         assert mesh.normals is not None
