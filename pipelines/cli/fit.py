@@ -77,12 +77,21 @@ def _fit(arguments: argparse.Namespace) -> int:
     config = new_settings(arguments, FitConfig)
     if arguments.mesh is None:
         refuse(arguments, ["no_colors"], "is about --mesh FILE; leave it out, or add that")
-    if arguments.tiles is not None or arguments.tile_size is not None:
+    if arguments.tiles is not None or arguments.tile_size is not None or _is_tiled(arguments):
         return _fit_tiles(arguments, config)
     refuse(arguments, ["ray_address"], "is for tiles; add --tiles auto, or leave it out")
     if len(arguments.clouds) > 1 or arguments.jobs is not None:
         return _fit_many(arguments, config)
     return _fit_one(arguments, arguments.clouds[0], config)
+
+
+def _is_tiled(arguments: argparse.Namespace) -> bool:
+    """Whether a fit in tiles goes on."""
+    if not arguments.resume:
+        return False
+    from ..fit.tiles import PLAN_FILE
+
+    return (arguments.out / PLAN_FILE).is_file()
 
 
 def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
@@ -183,9 +192,8 @@ def _fit_tiles(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     jobs, address = arguments.jobs or 1, arguments.ray_address
     check_jobs(jobs, address)
     check_new_run(arguments.out, resume=False, force=arguments.force or arguments.resume)
-    how = ("--tiles", "auto") if arguments.tile_size is None else ("--tile-size", arguments.tile_size)
     more = ("--jobs", jobs) * (jobs > 1) + ("--ray-address", address) * (address is not None)
-    again = command_line("fit", cloud, "-o", arguments.out, *how, *more, "--resume")
+    again = command_line("fit", cloud, "-o", arguments.out, *more, "--resume")
     with training(f"to continue: {again}", quiet=arguments.quiet, at_any_time=True) as show:
         report = show or (lambda _: None)
         job = plan_fit(cloud, arguments.out, config, size=arguments.tile_size, resume=arguments.resume, report=report)
