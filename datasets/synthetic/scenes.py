@@ -86,16 +86,19 @@ def render_scene(
         shaded: whether a fixed lamp lights the shape; without it, the images show the paint itself.
         glossy: whether the lamp has a highlight that moves with the eye.
         depths: whether each image has the depths of its pixels' centres.
-        progress: called with ``(done, total)`` after every image.
+        progress: called with ``(done, total)`` after every image, or several small ones.
 
     Raises:
         ValueError: ``views``, ``size`` or ``samples`` is not positive.
     """
+    cameras = scene_cameras(scene, views=views, size=size, seed=seed)
+    together = max(1, RAYS_AT_ONCE // max(1, cameras[0].width * cameras[0].height * samples**2))
     images: list[PosedImage] = []
-    for camera in scene_cameras(scene, views=views, size=size, seed=seed):
-        color, mask = render_view(scene, camera, samples=samples, shaded=shaded, glossy=glossy)
-        depth = scene_depths(scene, camera) if depths else None
-        images.append(PosedImage(f"{len(images):03d}.png", camera, color, mask, depth))
+    for first in range(0, views, together):
+        some = cameras[first : first + together]
+        maps = scene_depths(scene, some) if depths else [None] * len(some)
+        for camera, seen, depth in zip(some, _pictures(scene, some, samples, shaded, glossy), maps, strict=True):
+            images.append(PosedImage(f"{len(images):03d}.png", camera, *seen, depth))
         if progress is not None:
             progress(len(images), views)
     points = sample_surface(scene.field, 1000, seed=seed).points
@@ -103,18 +106,25 @@ def render_scene(
     return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name), seen)
 
 
-def scene_depths(scene: Scene, camera: Camera) -> DepthMap:
-    """Depths ``(H, W)`` along the axis of view at the centres of a camera's pixels; NaN for a miss."""
-    hits, _ = _traced(scene, camera)
-    ahead = (hits.position - camera.eye) @ camera.forward
-    numbers = torch.where(hits.mask, ahead, torch.nan).float().numpy()
-    return DepthMap(numbers, camera, "metric", Path(scene.name))
+def scene_depths(scene: Scene, cameras: Sequence[Camera]) -> list[DepthMap]:
+    """Depths ``(H, W)`` along the axes of view at the centres of the pixels of cameras of one size; NaN for a miss."""
+    hits, _ = _traced(scene, cameras)
+    maps = []
+    for camera, position, mask in zip(cameras, hits.position, hits.mask, strict=True):
+        numbers = torch.where(mask, (position - camera.eye) @ camera.forward, torch.nan).float().numpy()
+        maps.append(DepthMap(numbers, camera, "metric", Path(scene.name)))
+    return maps
 
 
-def _traced(scene: Scene, camera: Camera) -> tuple[Hits, Tensor]:
-    """Hits of a camera's rays ``(H, W)``, and their directions ``(H, W, 3)``."""
-    eye, along = camera.rays(dtype=torch.float64)
-    return sphere_trace(scene.field, eye.expand_as(along), along, tolerance=1e-9, lipschitz=scene.lipschitz), along
+def _traced(scene: Scene, cameras: Sequence[Camera]) -> tuple[Hits, Tensor]:
+    """Hits of the rays ``(V, H, W)`` of V cameras of one size, and their directions ``(V, H, W, 3)``.
+
+    They are traced together: a few rays take as long as thousands.
+    """
+    rays = [camera.rays(dtype=torch.float64) for camera in cameras]
+    along = torch.stack([directions for _, directions in rays])
+    eyes = torch.stack([eye.expand_as(directions) for eye, directions in rays])
+    return sphere_trace(scene.field, eyes, along, tolerance=1e-9, lipschitz=scene.lipschitz), along
 
 
 def _observations(scene: Scene, points: Float64, cameras: Sequence[Camera]) -> NDArray[np.int64]:
@@ -133,19 +143,27 @@ def render_view(
     scene: Scene, camera: Camera, *, samples: int = 3, shaded: bool = False, glossy: bool = False
 ) -> tuple[Float32, Float32]:
     """One picture of a scene (see `developed`): display RGB ``(H, W, 3)`` and mask ``(H, W)``, both in [0, 1]."""
+    return _pictures(scene, [camera], samples, shaded, glossy)[0]
+
+
+def _pictures(
+    scene: Scene, cameras: Sequence[Camera], samples: int, shaded: bool, glossy: bool
+) -> list[tuple[Float32, Float32]]:
+    """`render_view` of several cameras of one size: some rows of all of them at a time."""
     if samples < 1:
         raise ValueError(f"samples={samples}: expected at least one")
-    rows = max(1, RAYS_AT_ONCE // (camera.width * samples**2))
+    width, height = cameras[0].width, cameras[0].height
+    rows = max(1, RAYS_AT_ONCE // (len(cameras) * width * samples**2))
     strips = []
-    for first in range(0, camera.height, rows):
-        strip = camera.strip(first, min(rows, camera.height - first))
-        hits, along = _traced(scene, strip.resized(samples * strip.width, samples * strip.height))
+    for first in range(0, height, rows):
+        some = [camera.strip(first, min(rows, height - first)) for camera in cameras]
+        hits, along = _traced(scene, [each.resized(samples * width, samples * each.height) for each in some])
         mask = hits.mask.numpy()
         light = np.zeros((*mask.shape, 3))
         light[mask] = _light(scene, hits.position.numpy()[mask], along.numpy()[mask], shaded, glossy)
-        strips.append(developed(light, mask, samples))
-    color, mask = (np.concatenate(part) for part in zip(*strips, strict=True))
-    return color, mask
+        strips.append([developed(light[view], mask[view], samples) for view in range(len(cameras))])
+    views = ((np.concatenate(part) for part in zip(*own, strict=True)) for own in zip(*strips, strict=True))
+    return [(color, mask) for color, mask in views]
 
 
 def _light(scene: Scene, points: Float64, directions: Float64, shaded: bool, glossy: bool) -> Float64:

@@ -1,6 +1,7 @@
 """Scenes whose images are known in closed form: what is drawn must be that."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -41,22 +42,23 @@ def test_pixels_have_the_colour_of_the_point_they_see(sphere):
     assert color.dtype == mask.dtype == np.float32
 
 
-@pytest.mark.parametrize("at_once", [1, 1 << 17])
-def test_rows_that_are_traced_together_show_what_each_does_alone(at_once, monkeypatch):
+@pytest.mark.parametrize("at_once", [1, 2 * 16**2, 1 << 17])
+def test_views_that_are_traced_together_show_what_each_does_alone(at_once, monkeypatch):
     monkeypatch.setattr(scenes, "RAYS_AT_ONCE", at_once)
     told: list[tuple[int, int]] = []
     traced: list[int] = []
 
-    def spied(scene: Scene, camera: Camera):
-        traced.append(camera.width * camera.height)
-        return trace(scene, camera)
+    def spied(scene: Scene, cameras: Sequence[Camera]):
+        traced.append(sum(camera.width * camera.height for camera in cameras))
+        return together_traced(scene, cameras)
 
-    trace = scenes._traced
+    together_traced = scenes._traced
     monkeypatch.setattr(scenes, "_traced", spied)
     scene = SCENES["figure"]()
     told_at = {"progress": lambda *at: told.append(at)}
     images = render_scene(scene, views=3, size=8, samples=2, shaded=True, depths=True, **told_at)
-    assert told == [(done, 3) for done in (1, 2, 3)]
+    together = {1: 1, 2 * 16**2: 2}.get(at_once, 3)
+    assert told == [(done, 3) for done in (*range(together, 3, together), 3)]
     # No more than may be at once, or a row of a picture, or the depths of one.
     assert max(traced) <= max(at_once, 2 * 16, 8**2)
     monkeypatch.undo()
@@ -64,7 +66,7 @@ def test_rows_that_are_traced_together_show_what_each_does_alone(at_once, monkey
         color, mask = render_view(scene, view.camera, samples=2, shaded=True)
         np.testing.assert_allclose(view.color, color, atol=1e-6)
         np.testing.assert_allclose(view.mask, mask, atol=1e-6)
-        alone = scenes.scene_depths(scene, view.camera)
+        alone = scenes.scene_depths(scene, [view.camera])[0]
         np.testing.assert_allclose(view.depth.numbers, alone.numbers, atol=1e-6)
 
 
