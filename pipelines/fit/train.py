@@ -174,7 +174,8 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         level_done: LevelDone | None,
     ) -> None:
         super().__init__(config, folder, budget, report)
-        self.cloud, self.source, self.origin, self.level_done = cloud, source, origin, level_done
+        self.cloud, self.source, self.level_done = cloud, source, level_done
+        self.origin = {**named_cloud(source, folder.path), **origin}
         self.preparation_seconds = time.monotonic() - budget.started
         self.similarity = cloud.similarity
         self.fingerprint = digest_of((cloud.points, cloud.normals))
@@ -471,7 +472,6 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
     def record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
         return {
-            **named_cloud(self.source, self.folder.path),
             **self.origin,
             "cleaning": dataclasses.asdict(self.cloud.report),
             "signs": None if self.signs is None else self.signs.record(),
