@@ -225,7 +225,7 @@ def cube_tables() -> CubeTables:
 
 
 _BITS = np.array([1, 2, 4])
-_OFFSETS: Ints = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
+OFFSETS: Ints = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
 
 
 class NoSurfaceError(ValueError):
@@ -397,7 +397,7 @@ class _Corners:
         count = 8 * len(self.owners)
         self.value = np.zeros(count, centres.dtype)
         self.known = np.zeros(count, bool)
-        self._set(self.rows(_OFFSETS[13]), centres[order])
+        self._set(self.rows(OFFSETS[13]), centres[order])
         points, values = known
         keys = (points // 2 + 1) @ self.strides
         owner = np.minimum(np.searchsorted(self.owners, keys), len(self.owners) - 1).astype(np.int32)
@@ -444,11 +444,11 @@ class _Corners:
             owner = np.minimum(np.searchsorted(self.owners, keys), len(self.owners) - 1).astype(np.int32)
             listed = self.owners[owner] == keys
             owner, values = owner[listed], centres[listed]
-            for offset in _OFFSETS[np.all(corner == _OFFSETS // 2, axis=1)]:
+            for offset in OFFSETS[np.all(corner == OFFSETS // 2, axis=1)]:
                 rows, reach = self._row(owner, offset), slope * math.sqrt(((offset - 1) ** 2).sum())
                 low[rows], high[rows] = np.maximum(low[rows], values - reach), np.minimum(high[rows], values + reach)
         touched = np.zeros(len(self.value), bool)
-        for offset in _OFFSETS:
+        for offset in OFFSETS:
             touched[self.rows(offset)] = True
         # Where two centres contradict each other the field is steeper than L: ask it.
         unsure = touched & ~self.known & ((low > 0) == (high < 0))
@@ -476,7 +476,7 @@ class _Corners:
     def _cases(self) -> NDArray[np.uint8]:
         """The case of each of the eight cells of each block, ``(8, B)``; cells beyond the box are empty."""
         cases = np.zeros((8, len(self.blocks)), np.uint8)
-        for offset in _OFFSETS:
+        for offset in OFFSETS:
             inside = self.inside[self.rows(offset)]
             for cell in np.flatnonzero(((offset >= CORNERS) & (offset <= CORNERS + 1)).all(axis=1)):
                 cases[cell] |= inside.astype(np.uint8) << np.uint8((offset - CORNERS[cell]) @ _BITS)
@@ -490,7 +490,7 @@ class _Corners:
         found = [self.keys[:0]]
         for axis in range(3):
             for side, step in ((0, -1), (2, 1)):
-                face = [self.inside[self.rows(offset)] for offset in _OFFSETS[_OFFSETS[:, axis] == side]]
+                face = [self.inside[self.rows(offset)] for offset in OFFSETS[OFFSETS[:, axis] == side]]
                 place = self.blocks[:, axis] // 2 + step
                 open_ = ~(np.logical_and.reduce(face) | ~np.logical_or.reduce(face))
                 keys = self.keys[open_ & (place >= 0) & (place < cells[axis])] + step * self.strides[axis]
@@ -509,7 +509,7 @@ class _Corners:
         crossed = [np.flatnonzero((case != 0) & (case != 255)) for case in cases]
         chosen = np.concatenate([case[rows] for case, rows in zip(cases, crossed, strict=True)])
         if not len(chosen):
-            centres = self.rows(_OFFSETS[13])
+            centres = self.rows(OFFSETS[13])
             raise NoSurfaceError(
                 _where_signs_are(self.value[centres], self.points(centres), self.lattice, self.sampler)
             )

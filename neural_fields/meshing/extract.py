@@ -86,8 +86,6 @@ def extract_mesh(
     """
     field = solid(field)
     positive(lipschitz=lipschitz, batch=batch)
-    if not 0 < clearance < 0.5:
-        raise ValueError(f"clearance={clearance}: expected a fraction of a cell in (0, 0.5)")
     level = field.resolve_level(level)
     lipschitz = field.slope_bound(lipschitz)
     sampler = Sampler(field, Lattice.over(bounds, resolution), batch, progress)
@@ -104,6 +102,8 @@ def extract_surface(
     given: Given | None = None,
 ) -> tuple[Mesh, ActiveCells, Ints]:
     """The mesh in the box of a sampler, its cells, and for each vertex the rows ``(V, 2)`` of the ends of its edge."""
+    if not 0 < clearance < 0.5:
+        raise ValueError(f"clearance={clearance}: expected a fraction of a cell in (0, 0.5)")
     try:
         along = 32 if given is None else 8
         blocks, centres, kept = cull_blocks(sampler, level=level, lipschitz=lipschitz, along=along)

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from ..backend.errors import positive
 from ..fields.field import FieldLike, solid
-from ._cells import CORNERS, Bounds, Floats, Given, Ints, Lattice, NoSurfaceError, Progress, Sampler, cull_blocks
-from .extract import DEFAULT_BOUNDS, extract_surface
+from ._cells import CORNERS, OFFSETS, Floats, Given, Ints, Lattice, NoSurfaceError, Progress, Sampler, cull_blocks
+from .extract import DEFAULT_BOUNDS, Bounds, extract_surface
 from .mesh import Mesh
 
 Place = tuple[int, int, int]
-
-_AROUND = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), -1).reshape(27, 3)
 
 
 class Part(NamedTuple):
@@ -113,20 +111,18 @@ def extract_parts(
         place: Place = next(iter(waiting))
         del waiting[place]
         part = lattice.part(np.array(place) * cells, cells)
-        beside = np.array(place) + _AROUND
-        around = [
-            tuple(each) for each in beside[((beside >= 0) & (beside * cells < lattice.shape)).all(axis=1)].tolist()
-        ]
+        beside = np.array(place) + OFFSETS - 1
+        exists = ((beside >= 0) & (beside * cells < lattice.shape)).all(axis=1)
+        around = [tuple(each) for each in beside[exists].tolist()]
         known = [borders[each] for each in around if each in borders]
         try:
             found, border = _part(Sampler(field, part, batch), size, place, known, level, slope, clearance=clearance)
         except NoSurfaceError:
-            found, border = None, None
-        done += 1
-        if progress is not None:
-            progress("parts", done, done + len(waiting))
-        if found is None or border is None:
             continue
+        finally:
+            done += 1
+            if progress is not None:
+                progress("parts", done, done + len(waiting))
         borders[place] = border
         starts, ends = _ends(border.edges, size)
         for other in around:

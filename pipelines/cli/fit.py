@@ -77,21 +77,17 @@ def _fit(arguments: argparse.Namespace) -> int:
     config = new_settings(arguments, FitConfig)
     if arguments.mesh is None:
         refuse(arguments, ["no_colors"], "is about --mesh FILE; leave it out, or add that")
-    if arguments.tiles is not None or arguments.tile_size is not None or _is_tiled(arguments):
+    tiled = arguments.tiles is not None or arguments.tile_size is not None
+    if arguments.resume and not tiled:
+        from ..fit.tiles import PLAN_FILE
+
+        tiled = (arguments.out / PLAN_FILE).is_file()
+    if tiled:
         return _fit_tiles(arguments, config)
     refuse(arguments, ["ray_address"], "is for tiles; add --tiles auto, or leave it out")
     if len(arguments.clouds) > 1 or arguments.jobs is not None:
         return _fit_many(arguments, config)
     return _fit_one(arguments, arguments.clouds[0], config)
-
-
-def _is_tiled(arguments: argparse.Namespace) -> bool:
-    """Whether a fit in tiles goes on."""
-    if not arguments.resume:
-        return False
-    from ..fit.tiles import PLAN_FILE
-
-    return (arguments.out / PLAN_FILE).is_file()
 
 
 def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:

@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from ..training.settings import given_flags, input_error
-from .common import Command, add_flags, positive, whole, write_json
+from ..training.settings import given_flags
+from .common import Command, add_flags, positive, refuse, whole, write_json
 
 if TYPE_CHECKING:
     from ..mesh.solids import Made
@@ -59,8 +59,7 @@ def _mesh(arguments: argparse.Namespace) -> int:
     started = time.monotonic()
     if arguments.format is not None:
         return _scene(arguments, started)
-    if arguments.crs is not None:
-        raise input_error("--crs: goes with --format 3dtiles")
+    refuse(arguments, ["crs"], "goes with --format 3dtiles; add it, or leave this out")
     options = MeshOptions(**given_flags(arguments, MeshOptions))
     if arguments.json and options.report is None and options.texture is None:
         options = dataclasses.replace(options, report=True)
@@ -79,11 +78,9 @@ def _scene(arguments: argparse.Namespace, started: float) -> int:
     from ..mesh.scene import SceneOptions, scene_of_run
     from ..training.progress import progress_bars
 
+    others = MeshOptions.__dataclass_fields__.keys() - SceneOptions.__dataclass_fields__.keys()
+    refuse(arguments, sorted(others), "does not go with --format 3dtiles; leave it out")
     given = given_flags(arguments, SceneOptions)
-    plain = MeshOptions()
-    for name, value in given_flags(arguments, MeshOptions).items():
-        if name not in given and value != getattr(plain, name):
-            raise input_error(f"--{name.replace('_', '-')}: does not go with --format 3dtiles; leave it out")
     with progress_bars(counting=True) as report:
         scene = scene_of_run(arguments.run, arguments.out, SceneOptions(**given), say=print, report=report)
     print(

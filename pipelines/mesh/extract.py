@@ -23,7 +23,7 @@ from ...neural_fields.meshing.extract import extract_mesh, map_normals, surface_
 from ...neural_fields.tracing.sphere import map_attribute
 from ..surface.surface import Support, in_region, keep_largest, read_support, trim_distance, visible_part, without_blobs
 from ..texture.transport import Colors, colors_of_run
-from ..training.folder import TEXTURE_FILE, chosen_level, find_field, fitted_cloud, load_still
+from ..training.folder import chosen_level, find_field, fitted_cloud, load_still
 from .atlas import Decimation, check_tools, decimated
 from .bake import check_texture_size, textured_mesh
 from .files import check_mesh_path, check_textured_path, placement_of, write_mesh
@@ -197,20 +197,19 @@ def export_run(
         mesh, decimation = decimated(mesh, options.faces, unit=similarity.scale)
         mesh = dataclasses.replace(mesh, normals=_unit_normals(field, mesh, level=normal_level))
         say(decimation.describe(options.unit or "input units"))
-    colored = options.colors and file.with_name(TEXTURE_FILE).is_file()
-    colors = colors_of_run(file, field, options.time) if colored else None
+    colors = colors_of_run(file, field, options.time) if options.colors else None
     line = placement.describe(Path(out).suffix)
     if line is not None:
         say(f"coordinates: {line}")
     if options.texture is not None:
         mapped = field.num_levels - 1 if options.normal_level is None else normal_level
-        colors_at = None if colors is None else functools.partial(_evaluated, colors)
+        colors_at = None if colors is None else functools.partial(evaluated, colors)
         normals_at = functools.partial(normals_near, field, level=mapped)
         size, faces = options.texture, options.texture_faces
         baked = (mesh, similarity, colors_at, normals_at)
         return Exported(textured_mesh(out, *baked, size=size, faces=faces, placement=placement))
     if colors is not None:
-        mesh = dataclasses.replace(mesh, colors=_evaluated(colors, mesh.vertices))
+        mesh = dataclasses.replace(mesh, colors=evaluated(colors, mesh.vertices))
     write_mesh(out, mesh, similarity, placement)
     suffix, printing = Path(out).suffix.lower(), None
     if options.report or (options.report is None and suffix == ".stl"):
@@ -253,7 +252,8 @@ def _visible(mesh: Mesh, support: Support, say: Callable[[str], None], *, cut: b
     return part
 
 
-def _evaluated(colors: Colors, points: NDArray[np.float64]) -> NDArray[np.float32]:
+def evaluated(colors: Colors, points: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Colours ``(N, 3)`` at points ``(N, 3)``."""
     return colors(torch.from_numpy(points).float()).numpy()
 
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -24,17 +22,25 @@ from ...datasets.clouds.point_cloud import unit_rows
 from ...neural_fields import InputError, Mesh, Similarity
 from ...neural_fields.backend.files import check_place, partial_of, remove, rename, write_json
 from ...neural_fields.fields.similarity import Placement
-from ...neural_fields.meshing._cells import Bounds
+from ...neural_fields.meshing._cells import CORNERS, Bounds
 from ...neural_fields.meshing.extract import DEFAULT_BOUNDS, NoSurfaceError, surface_needed
-from ...neural_fields.meshing.mesh import write_glb_mesh
 from ...neural_fields.meshing.parts import Place, extract_parts
-from ..surface.surface import Footing, Support, component_of_faces, footing, keep_faces, read_support
+from ..surface.surface import (
+    Footing,
+    Support,
+    component_of_vertices,
+    footing,
+    joined,
+    keep_faces,
+    read_support,
+    within_sphere,
+)
 from ..texture.transport import Colors, colors_of_run
-from ..training.folder import TEXTURE_FILE, chosen_level, find_field, load_still
+from ..training.folder import chosen_level, find_field, load_still
 from ..training.progress import Report, counted, silent
 from .atlas import deviation
-from .earth import Stand, on_globe, upright
-from .extract import chosen_resolution
+from .earth import Float64, Stand, on_globe, upright
+from .extract import chosen_resolution, evaluated
 from .files import placement_of
 
 SCENE_FILE = "tileset.json"
@@ -42,7 +48,6 @@ SEEN = 10_000  # points of each mesh at which errors are measured: of the Armadi
 TILES = "tiles"  # folder of the GLB files
 PARTS = "parts"  # folder of the meshes, while a scene is written
 NOTHING = np.empty(0, np.int64)  # shared with other parts
-_CUBE = list(itertools.product((0, 1), repeat=3))
 
 
 @dataclass(frozen=True)
@@ -82,15 +87,6 @@ class Scene(NamedTuple):
     error: float
 
 
-class _Tile(NamedTuple):
-    """An entry of the tree, and what its parent needs: the corners of its box, and its error."""
-
-    entry: dict[str, Any]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    error: float
-
-
 def scene_of_run(
     run: str | Path,
     out: str | Path,
@@ -124,8 +120,7 @@ def scene_of_run(
     say(f"coordinates: {stand.line}")
     resolution = chosen_resolution(field, options.resolution, support, level, say)
     bounds, cells, steps = _lattice(support, resolution, options.cells)
-    colored = options.colors and file.with_name(TEXTURE_FILE).is_file()
-    colors = colors_of_run(file, field, options.time) if colored else None
+    colors = colors_of_run(file, field, options.time) if options.colors else None
     partial = partial_of(out)
     try:
         for step in range(steps):
@@ -145,18 +140,20 @@ def scene_of_run(
                 ):
                     if "region" not in record:
                         _keep(folder, part.place, part.mesh, part.shared, part.edges)
-                    elif (inside := ((part.mesh.vertices**2).sum(axis=1) <= 1)[part.mesh.faces].all(axis=1)).any():
-                        _keep(folder, part.place, keep_faces(part.mesh, inside), NOTHING, NOTHING)
+                    elif (inside := within_sphere(part.mesh)) is not None:
+                        _keep(folder, part.place, inside, NOTHING, NOTHING)
             if support is not None and not support.visible and not options.keep_unsupported:
                 _drop_unsupported(folder, support)
-        writer = _Writer(partial, stand, similarity, colors, counted(report or silent, "writing tiles"))
+        show, total = counted(report or silent, "writing tiles"), sum(1 for _ in (partial / PARTS).rglob("*.npz"))
+        writer = _Writer(partial, stand, similarity, colors, show, total)
         root = writer.tile(steps - 1, (0, 0, 0))
         if root is None:
             raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
-        extent = float(np.linalg.norm(root.high - root.low))
-        root.entry["transform"] = stand.transform.T.ravel().tolist()  # column by column
-        root.entry["refine"] = "REPLACE"
-        scene = {"asset": {"version": "1.1"}, "geometricError": max(extent, root.error), "root": root.entry}
+        low, high = _corners(root)
+        root["transform"] = stand.transform.T.ravel().tolist()  # column by column
+        root["refine"] = "REPLACE"
+        error = max(float(np.linalg.norm(high - low)), root["geometricError"])
+        scene = {"asset": {"version": "1.1"}, "geometricError": error, "root": root}
         out.mkdir(parents=True, exist_ok=True)
         remove(out / SCENE_FILE)  # of an older scene
         shutil.rmtree(out / TILES, ignore_errors=True)
@@ -164,7 +161,7 @@ def scene_of_run(
         write_json(out / SCENE_FILE, scene)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return Scene(writer.tiles, steps, writer.faces, root.error)
+    return Scene(writer.tiles, steps, writer.faces, root["geometricError"])
 
 
 def _stand(
@@ -187,14 +184,13 @@ def _lattice(support: Support | None, resolution: int, cells: int) -> tuple[Boun
         least, most = support.points.min(axis=0), support.points.max(axis=0)
         room = support.radius + 0.05 * float((most - least).max())  # a surface bulges where nothing was measured
         low, high = np.maximum(low, least - room), np.minimum(high, most + room)
-    across = max(1, math.ceil(float((high - low).max()) / edge))
-    steps = 1 + max(0, math.ceil(math.log2(across / cells)))
+    along = np.maximum(2, np.ceil((high - low) / edge))
+    steps = 1 + max(0, math.ceil(math.log2(along.max() / cells)))
     multiple = 2 ** (steps - 1)
-    across = max(2, -(-across // multiple) * multiple)  # cells of all steps end at the same places
-    high = np.maximum(high, np.where((high - low) == (high - low).max(), low + across * edge, high))
+    along = np.ceil(along / multiple) * multiple  # cells of all steps end at the same places
     x, y, z = low.tolist()
-    i, j, k = high.tolist()
-    return ((x, y, z), (i, j, k)), across, steps
+    i, j, k = (low + along * edge).tolist()
+    return ((x, y, z), (i, j, k)), int(along.max()), steps
 
 
 def _path(folder: Path, place: Place) -> Path:
@@ -224,13 +220,11 @@ def _drop_unsupported(folder: Path, support: Support) -> None:
     edges, owners, found = [], [], []
     for path in paths:
         mesh, shared, lattice_edges = _kept(path)
-        number = component_of_faces(mesh)
-        of_vertex = np.zeros(len(mesh.vertices), np.int64)
-        of_vertex[mesh.faces] = number[:, None]
+        component = component_of_vertices(mesh)
         edges.append(lattice_edges)
-        owners.append(of_vertex[shared] + total)
-        numbers.append(number + total)
-        found.append(footing(mesh, number, tree, support.radius))
+        owners.append(component[shared] + total)
+        numbers.append(component[mesh.faces[:, 0]] + total)
+        found.append(footing(mesh, component, tree, support.radius))
         total += len(found[-1].area)
     order = np.argsort(edge := np.concatenate(edges), kind="stable")
     owner = np.concatenate(owners)[order]
@@ -253,38 +247,40 @@ def _drop_unsupported(folder: Path, support: Support) -> None:
             _keep(folder, (x, y, z), keep_faces(_kept(path)[0], kept), NOTHING, NOTHING)
 
 
+def _corners(entry: Mapping[str, Any]) -> tuple[Float64, Float64]:
+    """The lowest and the highest corner of the box of a tile."""
+    middle, half = np.split(np.array(entry["boundingVolume"]["box"])[[0, 1, 2, 3, 7, 11]], 2)
+    return middle - half, middle + half
+
+
+@dataclass
 class _Writer:
     """Writes tiles from the finest up, and counts them."""
 
-    def __init__(
-        self,
-        out: Path,
-        stand: Stand,
-        similarity: Similarity,
-        colors: Colors | None,
-        show: Callable[[int, int], None],
-    ) -> None:
-        self.out, self.stand, self.similarity, self.colors, self.show = out, stand, similarity, colors, show
-        self.total = sum(1 for _ in (out / PARTS).rglob("*.npz"))
-        self.tiles = self.faces = 0
+    out: Path
+    stand: Stand
+    similarity: Similarity
+    colors: Colors | None
+    show: Callable[[int, int], None]
+    total: int
+    tiles: int = 0
+    faces: int = 0  # of the finest
 
-    def tile(self, step: int, place: Place) -> _Tile | None:
-        """A tile with those below it; None where there is nothing."""
-        x, y, z = place
-        below: list[Place] = [(2 * x + i, 2 * y + j, 2 * z + k) for i, j, k in _CUBE] if step else []
+    def tile(self, step: int, place: Place) -> dict[str, Any] | None:
+        """The entry of a tile in the tree, with those below it; None where there is nothing."""
+        below: list[Place] = [tuple(each) for each in (2 * np.array(place) + CORNERS).tolist()] if step else []
         children = [tile for each in below if (tile := self.tile(step - 1, each)) is not None]
         path = _path(self.out / PARTS / str(step), place)
         mesh = _kept(path)[0] if path.is_file() else None
         if mesh is None and not children:
             return None
-        lows, highs = [tile.low for tile in children], [tile.high for tile in children]
+        boxes = [_corners(child) for child in children]
         entry: dict[str, Any] = {}
         if mesh is not None:
             placed = self._placed(mesh)
-            lows.append(placed.vertices.min(axis=0))
-            highs.append(placed.vertices.max(axis=0))
+            boxes.append((placed.vertices.min(axis=0), placed.vertices.max(axis=0)))
             entry["content"] = {"uri": self._write(step, place, placed)}
-        low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+        low, high = (pick([box[k] for box in boxes], axis=0) for k, pick in enumerate((np.min, np.max)))
         middle, half = (low + high) / 2, (high - low) / 2
         volume = {"boundingVolume": {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]}}
         error = 0.0
@@ -293,36 +289,23 @@ class _Writer:
             finer = [_kept(file)[0] for file in files if file.is_file()]
             apart = float(np.linalg.norm(high - low))  # if only one of the two has a surface
             if mesh is not None and finer:
-                apart = deviation(_joined(finer), mesh, probes=SEEN)[0] * self.similarity.scale * self.stand.metres
-            error = apart + max((tile.error for tile in children), default=0.0)
+                apart = deviation(joined(finer), mesh, probes=SEEN)[0] * self.similarity.scale * self.stand.metres
+            error = apart + max((child["geometricError"] for child in children), default=0.0)
             # A surface at the side of a cube may be in its neighbour at the next step: nothing is there in its place.
-            entry["children"] = [tile.entry for tile in children] or [volume | {"geometricError": 0.0}]
-        return _Tile(volume | {"geometricError": error} | entry, low, high, error)
+            entry["children"] = children or [volume | {"geometricError": 0.0}]
+        return volume | {"geometricError": error} | entry
 
     def _placed(self, mesh: Mesh) -> Mesh:
         assert mesh.normals is not None
-        colors = None
-        if self.colors is not None:
-            colors = self.colors(torch.from_numpy(mesh.vertices).float()).numpy()
+        colors = None if self.colors is None else evaluated(self.colors, mesh.vertices)
         vertices = self.stand.points(self.similarity.to_input(mesh.vertices))
         normals = unit_rows(mesh.normals @ self.stand.turn.T).astype(np.float32)
         return dataclasses.replace(mesh, vertices=vertices, normals=normals, colors=colors)
 
     def _write(self, step: int, place: Place, mesh: Mesh) -> str:
         name = f"{TILES}/{step}/{'_'.join(map(str, place))}.glb"
-        path = self.out / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        x, y, z = ((low + high) / 2).tolist()
-        home = Similarity((x, y, z), float(np.linalg.norm(high - low)) / 2 or 1.0)
-        write_glb_mesh(path, mesh, home, Placement("z", "m"))
+        mesh.export(self.out / name, up="z", unit="m")
         self.tiles += 1
         self.faces += len(mesh.faces) if step == 0 else 0
         self.show(self.tiles, self.total)
         return name
-
-
-def _joined(meshes: list[Mesh]) -> Mesh:
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))

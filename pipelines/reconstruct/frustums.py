@@ -15,6 +15,7 @@ from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImages
 from ...neural_fields.meshing.extract import Mesh
 from ..render.shade import COLOR_MAPS, apply_color_map
+from ..surface.surface import joined
 
 Float64 = NDArray[np.float64]
 Rgb = tuple[float, float, float]
@@ -57,7 +58,7 @@ def camera_mesh(images: PosedImages) -> Mesh:
     if images.points is not None:
         step = 1 + (len(images.points) - 1) // STYLE.sparse_points
         parts.append(_octahedra(images.similarity.to_unit(images.points[::step]), STYLE.wire, STYLE.dark))
-    return _joined(parts)
+    return joined(parts)
 
 
 def frustum_size(cameras: Sequence[Camera]) -> tuple[float, float]:
@@ -123,7 +124,7 @@ def _wire_sphere(*, meridians: int = 6, parallels: int = 5, sides: int = 64) -> 
 def _tubes(segments: Float64, radius: float, color: Rgb | Float64) -> Mesh:
     """Three-sided tubes along segments ``(S, 2, 3)``, closed at both ends."""
     tubes = [_painted(trimesh.creation.cylinder(radius, segment=ends, sections=3), color) for ends in segments]
-    return _joined(tubes)
+    return joined(tubes)
 
 
 def _octahedra(points: Float64, radius: float, color: Rgb) -> Mesh:
@@ -136,12 +137,3 @@ def _octahedra(points: Float64, radius: float, color: Rgb) -> Mesh:
 def _painted(mesh: trimesh.Trimesh, color: Rgb | Float64) -> Mesh:
     vertices = np.asarray(mesh.vertices)
     return Mesh(vertices, np.asarray(mesh.faces), colors=np.tile(np.asarray(color, np.float64), (len(vertices), 1)))
-
-
-def _joined(parts: Sequence[Mesh]) -> Mesh:
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    return Mesh(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]).astype(np.int32),
-        colors=np.concatenate([part.colors for part in parts if part.colors is not None]).astype(np.float32),
-    )

@@ -25,7 +25,7 @@ from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 from ..fit.cloud import CloudDistance
 from ..surface.surface import read_surface, sample_points
 from ..texture.transport import Colors, colors_of_run
-from ..training.folder import TEXTURE_FILE, chosen_level, find_field, fitted_cloud, is_field, load_still
+from ..training.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
 from .picture import Image, check_picture_path, contact_sheet, write_picture
@@ -96,7 +96,7 @@ def _field_subject(file: Path, options: RenderOptions) -> Subject:
     panels = [_panel(level, normal_level)]
     if options.levels:
         panels = [_panel(index, index) for index in range(finest + 1)] + ([_panel(0, finest)] if finest else [])
-    colors = colors_of_run(file, field, options.time) if file.with_name(TEXTURE_FILE).is_file() else None
+    colors = colors_of_run(file, field, options.time)
     subject = subject_of(field, similarity, name=file, panels=panels, colors=colors)
     source = lambda: fitted_cloud(file, metadata, remedy="name it with --reference FILE")  # noqa: E731
     return dataclasses.replace(subject, fitted_to=source)

@@ -111,12 +111,30 @@ def components(surface: Mesh) -> int:
     return int(component_of_faces(surface.merged).max(initial=-1)) + 1
 
 
-def component_of_faces(mesh: Mesh) -> NDArray[np.intp]:
-    """The number ``(F,)`` from 0 up of the connected component of each face, through vertices that faces share."""
+def component_of_vertices(mesh: Mesh) -> NDArray[np.intp]:
+    """The number ``(V,)`` from 0 up of each vertex's connected component, through faces; any of one without faces."""
     a, b = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
     size = len(mesh.vertices)
     graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(size, size)).tocsr()
-    return np.unique(connected_components(graph, directed=False)[1][mesh.faces[:, 0]], return_inverse=True)[1]
+    number = connected_components(graph, directed=False)[1]
+    return np.searchsorted(np.unique(number[a]), number)
+
+
+def component_of_faces(mesh: Mesh) -> NDArray[np.intp]:
+    """The same of each face ``(F,)``."""
+    return component_of_vertices(mesh)[mesh.faces[:, 0]]
+
+
+def joined(parts: Sequence[Mesh]) -> Mesh:
+    """One mesh of several, whose vertices stay apart; with colours if all have some."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=True)]
+    colors = [part.colors for part in parts if part.colors is not None]
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate(faces).astype(np.int32),
+        colors=np.concatenate(colors).astype(np.float32) if len(colors) == len(parts) else None,
+    )
 
 
 def is_closed(surface: Mesh) -> bool:
@@ -189,13 +207,15 @@ def drop_unsupported(
     reach = support_radius(points) if radius is None else radius
     if not reach > 0:
         raise ValueError(f"radius={reach}: expected > 0")
-    number = component_of_faces(mesh)
-    found = footing(mesh, number, KDTree(points), reach)
+    component = component_of_vertices(mesh)
+    found = footing(mesh, component, KDTree(points), reach)
     kept = found.stands(spacing_of(np.asarray(points, np.float64)), least=least)
     if kept.all() or not kept.any():
         return Supported(mesh, 0, 0.0)
     return Supported(
-        keep_faces(mesh, kept[number]), int((~kept).sum()), float(found.area[~kept].sum() / found.area.sum())
+        keep_faces(mesh, kept[component[mesh.faces[:, 0]]]),
+        int((~kept).sum()),
+        float(found.area[~kept].sum() / found.area.sum()),
     )
 
 
@@ -215,18 +235,17 @@ class Footing(NamedTuple):
         return kept
 
 
-def footing(mesh: Mesh, number: NDArray[np.integer], tree: KDTree, reach: float) -> Footing:
-    """The `Footing` of a mesh, whose faces have the ``number`` ``(F,)`` of their component, on the points of a tree."""
+def footing(mesh: Mesh, component: NDArray[np.integer], tree: KDTree, reach: float) -> Footing:
+    """The `Footing` of a mesh, with the ``component`` ``(V,)`` of its vertices, on the points of a tree."""
+    number = component[mesh.faces[:, 0]]
     count = int(number.max()) + 1
     share = np.isfinite(tree.query(mesh.vertices, distance_upper_bound=reach, workers=-1)[0])[mesh.faces].mean(axis=1)
     areas = face_normals(mesh)[1]
-    of_vertex = np.zeros(len(mesh.vertices), np.int64)
-    of_vertex[mesh.faces] = number[:, None]
     used = np.unique(mesh.faces)
     corners = mesh.vertices[used]
     around = ((tree.data >= corners.min(axis=0) - reach) & (tree.data <= corners.max(axis=0) + reach)).all(axis=1)
     near, whose = KDTree(corners).query(tree.data[around], distance_upper_bound=reach, workers=-1)
-    own = of_vertex[used[np.asarray(whose)[np.isfinite(near)]]]
+    own = component[used[np.asarray(whose)[np.isfinite(near)]]]
     area, near_area, points = (
         np.bincount(which, weights, count).astype(np.float64)
         for which, weights in ((number, areas), (number, areas * share), (own, np.ones(len(own))))
@@ -268,9 +287,14 @@ def in_region(mesh: Mesh) -> Mesh | None:
 
     Outside, no ray is ever sampled, so that a network may have any sign there.
     """
-    inside = (mesh.vertices**2).sum(axis=1) <= 1
-    kept = inside[mesh.faces].all(axis=1)
-    return without_voids(keep_faces(mesh, kept)) if kept.any() else None
+    part = within_sphere(mesh)
+    return None if part is None else without_voids(part)
+
+
+def within_sphere(mesh: Mesh) -> Mesh | None:
+    """The faces with all corners in the unit sphere; None if there is none."""
+    kept = ((mesh.vertices**2).sum(axis=1) <= 1)[mesh.faces].all(axis=1)
+    return keep_faces(mesh, kept) if kept.any() else None
 
 
 def trim_distance(mesh: Mesh, points: NDArray[np.floating], distance: float) -> Mesh:

@@ -25,7 +25,7 @@ from ...neural_fields.spacetime.evolution import VectorField
 from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
 from ...neural_fields.tracing.sphere import project_to_surface
-from ..training.folder import find_field, load_motion
+from ..training.folder import TEXTURE_FILE, find_field, load_motion
 from .spread import CELL, SpreadColors
 from .train import texture_of
 
@@ -245,6 +245,8 @@ def colors_of_run(run: str | Path, field: Field, time: float | None) -> Colors |
     Raises:
         InputError: the texture is damaged or belongs to another field.
     """
+    if not find_field(run).with_name(TEXTURE_FILE).is_file():
+        return None
     moving = None if time is None else load_field(find_field(run), device=field.deltas.device).field
     colors = start_colors(run, field if moving is None else moving)
     if colors is None or moving is None or time is None:

@@ -42,10 +42,9 @@ def check_jobs(jobs: int, address: str | None = None) -> None:
     """Refuse less than one job, and what needs Ray where there is none, by an `InputError` before any work."""
     if jobs < 1:
         raise InputError(f"--jobs {jobs}: expected a whole number from 1")
-    if address is not None and importlib.util.find_spec("ray") is None:
-        raise InputError(f"--ray-address {address}: needs Ray; pip install mplicits[ray], or leave it out")
-    if jobs > 1 and importlib.util.find_spec("ray") is None:
-        raise InputError(f"--jobs {jobs}: needs Ray; pip install mplicits[ray], or leave --jobs out")
+    flag = f"--jobs {jobs}" if address is None else f"--ray-address {address}"
+    if (jobs > 1 or address is not None) and importlib.util.find_spec("ray") is None:
+        raise InputError(f"{flag}: needs Ray; pip install mplicits[ray], or leave it out")
 
 
 def run_jobs(

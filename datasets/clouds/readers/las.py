@@ -22,7 +22,7 @@ _VERSION = struct.Struct("<BB"), 24
 _SIZES = struct.Struct("<HIIBHI"), 94
 _SCALES = struct.Struct("<3d"), 131
 _SIZES_14 = struct.Struct("<QIQ"), 235
-SUFFIXES = (".las", ".laz")
+LAS_SUFFIXES = (".las", ".laz")
 GEO_KEYS = (3072, 2048)  # of GeoTIFF: the projected, and the geographic coordinate system
 USER_DEFINED = 32767  # which is no number of EPSG
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # of LASzip's items by their kind; extra bytes (14) have one for each byte
@@ -90,7 +90,7 @@ def read_las(path: Path, columns: str | None = None, *, drop_noise: bool = False
 
 def coordinate_system(path: Path) -> str | None:
     """The coordinate reference system of a LAS or LAZ file, as WKT or as EPSG:NUMBER; None if it names none."""
-    if path.suffix.lower() not in SUFFIXES:
+    if path.suffix.lower() not in LAS_SUFFIXES:
         return None
     laspy = _laspy(path, None)
     with _reading(path), laspy.open(path) as reader:

@@ -15,8 +15,7 @@ from ...files import readable
 from ..point_cloud import PointCloud, usable_rows
 from .columns import CloudStream
 from .e57 import read_e57
-from .las import SUFFIXES as _LAS
-from .las import LasStream, read_las
+from .las import LAS_SUFFIXES, LasStream, read_las
 from .meshes import read_obj, read_off, read_stl
 from .pcd import read_pcd
 from .ply import ply_stream, read_ply, read_ply_mesh
@@ -41,7 +40,7 @@ TABLE_READERS: dict[str, Callable[[Path, str | None], PointCloud]] = {
 """What reads which extension as a cloud, with the names of its columns where the file has none."""
 
 
-CLOUD_SUFFIXES: tuple[str, ...] = (*TABLE_READERS, *(end for end in MESH_READERS if end not in TABLE_READERS), *_LAS)
+CLOUD_SUFFIXES: tuple[str, ...] = tuple(dict.fromkeys((*TABLE_READERS, *MESH_READERS, *LAS_SUFFIXES)))
 """Extensions that `read_cloud` knows."""
 
 
@@ -59,7 +58,7 @@ def read_cloud(path: str | Path, *, columns: str | None = None, drop_noise: bool
     path = check_cloud_path(path)
     suffix = path.suffix.lower()
     with readable(path):
-        if suffix in _LAS:
+        if suffix in LAS_SUFFIXES:
             cloud = read_las(path, columns, drop_noise=drop_noise)
         elif suffix in TABLE_READERS:
             cloud = TABLE_READERS[suffix](path, columns)
@@ -103,7 +102,7 @@ def open_stream(path: str | Path, *, columns: str | None = None, drop_noise: boo
     path = check_cloud_path(path)
     suffix = path.suffix.lower()
     with readable(path):
-        if suffix in _LAS:
+        if suffix in LAS_SUFFIXES:
             return LasStream(path, columns, drop_noise=drop_noise)
         return {".ply": ply_stream, ".npy": npy_stream}.get(suffix, lambda *_: None)(path, columns)
 

@@ -4,6 +4,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from closed import assert_closed, directed_edges
 from fields import Scaled
 from mplicits.neural_fields import Box, Capsule, FunctionField, Jet, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
 from mplicits.neural_fields.fields.field import OneLevelField
@@ -29,20 +30,6 @@ class Tabulated(OneLevelField):
     def jet(self, x, *, level=-1):
         value = self.value(x, level=level)
         return Jet(torch.zeros_like(value), torch.ones_like(x), x.new_empty((*x.shape[:-1], 0)))
-
-
-def directed_edges(mesh: Mesh):
-    f = mesh.faces.astype(np.int64)
-    a, b = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).T
-    return a, b
-
-
-def assert_closed(mesh: Mesh):
-    """Every edge lies in exactly two faces, which run along it in opposite directions."""
-    a, b = directed_edges(mesh)
-    forth = np.sort(a * len(mesh.vertices) + b)
-    assert (np.diff(forth) > 0).all(), "two faces run along an edge in the same direction"
-    assert np.array_equal(forth, np.sort(b * len(mesh.vertices) + a)), "an edge lies in one face only"
 
 
 def assert_clean(mesh: Mesh):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from closed import assert_closed
 from mplicits.neural_fields import FunctionField, Mesh, NoSurfaceError, Sphere, Torus, extract_mesh
 from mplicits.neural_fields.meshing.parts import extract_parts
 
@@ -22,13 +23,6 @@ def joined(parts):
     assert np.array_equal(normals, normals[number])
     used, faces = np.unique(number[faces], return_inverse=True)
     return Mesh(vertices[used], faces.reshape(-1, 3), normals[used])
-
-
-def assert_closed(mesh):
-    a, b = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
-    forth = np.sort(a * len(mesh.vertices) + b)
-    assert (np.diff(forth) > 0).all()
-    assert np.array_equal(forth, np.sort(b * len(mesh.vertices) + a))
 
 
 def ordered(rows):

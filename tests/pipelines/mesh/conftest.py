@@ -1,7 +1,18 @@
-"""Colours and normals of surface points, to be baked and found again."""
+"""Colours and normals of surface points, to be baked and found again; the browser that shows them."""
 
 import numpy as np
 import pytest
+from browser import start_browser
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    driver = start_browser(tmp_path_factory.mktemp("chromium"))
+    if driver is None:
+        pytest.skip("no chromium and chromedriver on this machine")
+    driver.set_window_size(800, 800)
+    yield driver
+    driver.quit()
 
 
 @pytest.fixture(scope="session")

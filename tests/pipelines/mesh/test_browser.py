@@ -12,7 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import trimesh
-from browser import served, start_browser
+from browser import served
 from mplicits.neural_fields import Capsule, Similarity, Sphere, Union, extract_mesh
 from mplicits.neural_fields.fields.similarity import Placement
 from mplicits.neural_fields.meshing.extract import Mesh
@@ -113,16 +113,6 @@ def site(tmp_path_factory, painting, bumpy):
     write_mesh(folder / "figure.glb", figure(), MILLIMETRES, Placement("z", "mm", center=True))
     with served(functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))) as address:
         yield address
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    driver = start_browser(tmp_path_factory.mktemp("chromium"))
-    if driver is None:
-        pytest.skip("no chromium and chromedriver on this machine")
-    driver.set_window_size(800, 800)
-    yield driver
-    driver.quit()
 
 
 def drawn(browser, site, file, mode, similarity=UTM):

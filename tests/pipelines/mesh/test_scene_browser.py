@@ -8,7 +8,7 @@ import json
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from browser import served, start_browser
+from browser import served
 from mplicits.neural_fields import Similarity, Sphere, save_field
 from mplicits.pipelines.mesh.scene import SceneOptions, scene_of_run
 from npm import THREE, TILES, fetch
@@ -81,16 +81,6 @@ def site(tmp_path_factory):
     )
     with served(functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))) as address:
         yield address
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    driver = start_browser(tmp_path_factory.mktemp("chromium"))
-    if driver is None:
-        pytest.skip("no chromium and chromedriver on this machine")
-    driver.set_window_size(800, 800)
-    yield driver
-    driver.quit()
 
 
 @pytest.mark.parametrize(("distance", "pixels", "step"), [(20_000, 20, "2"), (60, 0.01, "0")])
