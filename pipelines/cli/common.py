@@ -341,7 +341,9 @@ class Program:
         if arguments[:1] == ["help"]:
             arguments = [*arguments[1:], "--help"]
         if not arguments or arguments[0] in HELP:
-            print(self.overview.format(commands=self._listed()))
+            width = max(map(len, self.commands))
+            listed = (f"  {name:<{width}}  {command.summary}" for name, command in self.commands.items())
+            print(self.overview.format(commands="\n".join(listed)))
             return 0 if arguments else 2
         if arguments[0] == "--version":
             from importlib.metadata import version  # late, as all that --help can do without
@@ -360,11 +362,6 @@ class Program:
         code = self.commands[name].run(given)
         sys.stdout.flush()
         return code
-
-    def _listed(self) -> str:
-        """A line for each command, with what it does."""
-        width = max(map(len, self.commands))
-        return "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in self.commands.items())
 
     def _fail(self, message: str) -> int:
         print(f"{self._short}: error: {' '.join(message.split())}", file=sys.stderr)

@@ -39,9 +39,8 @@ def examine() -> list[Finding]:
     asked = [
         line for line in importlib.metadata.requires(PACKAGE) or [] if not re.search("extra == .dev|^[^;]*==", line)
     ]
-    python = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     return [
-        Finding("ok", "Python", python),
+        Finding("ok", "Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
         *(_requirement(line) for line in asked),
         _cv2(),
         _threads(),

@@ -161,14 +161,12 @@ def _slice_arguments(parser: argparse.ArgumentParser) -> None:
     what = f"{', '.join(PICTURES)}; with {' or '.join(FILMS)} the plane sweeps through the shape"
     add_flags(parser, "--out", help=what)
     add("--axis", choices=("x", "y", "z"), help="the plane is across this axis (z)")
-    what = "coordinate on the axis, or per cent of the shape's extent: 30%% (50%%)"
-    add("--at", type=_place, metavar="C", help=what)
+    add("--at", type=_place, metavar="C", help="coordinate on the axis, or per cent of the shape's extent: 30%% (50%%)")
     add_flags(parser, "--up", help="the axis that points up in the picture (y)")
     add_flags(parser, "--size", type=whole(64, 8192), help="width, or width and height (800)")
     add("--iso", dest="lines", type=whole(2, 400), metavar="N", help="about so many iso-lines fit (40)")
     add_flags(parser, "--zoom", help="magnification (1: the whole shape)")
-    what = "what to zoom in on (default: the middle)"
-    add("--center", type=finite, nargs=3, metavar=("X", "Y", "Z"), help=what)
+    add("--center", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="what to zoom in on (default: the middle)")
     add("--no-bands", dest="bands", action="store_false", help="leave out the bands |f_i| < δ_i")
     add_flags(parser, "--frames", help="of a film (96)")
     add_flags(parser, "--fps")
@@ -186,11 +184,8 @@ def _slice(arguments: argparse.Namespace) -> int:
     given = given_flags(arguments, SliceOptions)
     place = given.pop("at", {})
     options = SliceOptions(**given, **place)
-
-    def work(progress: Callable[[int, int], None] | None) -> str:
-        return slice_run(arguments.run, arguments.out, options, progress=progress)
-
-    return _draw(arguments.out, "slices" if film else None, work)
+    title = "slices" if film else None
+    return _draw(arguments.out, title, lambda bar: slice_run(arguments.run, arguments.out, options, progress=bar))
 
 
 SLICE = Command(
@@ -224,8 +219,7 @@ def _animate_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--up", of="film, and a .glb, which is turned y-up: ")
     add_flags(parser, "--azimuth", "--elevation", "--samples", of="film: ")
     add_flags(parser, "--zoom", help="film: magnification of the middle (1)")
-    shadings = ("lambert", "headlight", "normals", "color")
-    add("--shading", choices=shadings, help="film: how it is shaded (lambert)")
+    add("--shading", choices=("lambert", "headlight", "normals", "color"), help="film: how it is shaded (lambert)")
     add("--shadows", action="store_true", help="film: shadows and occlusion, for twice the time or more")
 
 

@@ -49,13 +49,11 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--tiles", choices=["auto"], help="cut a cloud that one network cannot hold into tiles, by its number of points"
     )
     add("--tile-size", type=positive, metavar="LENGTH", help="cut it into tiles with edges of this length, in its unit")
-    what = "of a Ray cluster whose machines share RUN: fit tiles there"
-    add("--ray-address", metavar="ADDRESS", help=what)
+    add("--ray-address", metavar="ADDRESS", help="of a Ray cluster whose machines share RUN: fit tiles there")
     what = "then learn the colours, if there are any, and write the mesh (.ply, .obj, .stl, .glb)"
     add("--mesh", type=Path, metavar="FILE", help=what)
     add("--no-colors", action="store_true", help="leave the colours out of --mesh")
-    what = "show the growing field in the browser, checkpoint by checkpoint"
-    add("--watch", action="store_true", help=what)
+    add("--watch", action="store_true", help="show the growing field in the browser, checkpoint by checkpoint")
     add_settings(parser, FitConfig)
     add = parser.add_argument_group("depth maps (PNG, TIFF, NPY or NPZ, or a folder of them)").add_argument
     what = "camera JSON (ours, or Open3D's), or four numbers in pixels: FX FY CX CY"
@@ -128,8 +126,7 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
                     made = mesh.extract(say=said.append, progress=report)
     tell_budget(read_record(directory))
     print(describe(directory))
-    memory = peak_memory()
-    if memory is not None:
+    if (memory := peak_memory()) is not None:
         print(f"  peak memory  {memory / 2**20:,.0f} MiB")
     # A depth map shows one side of things; what the fit closes behind it is no part of them.
     trim = [] if depth is None else ["--trim-distance", f"{trim_suggestion(directory):.2g}"]
@@ -160,8 +157,7 @@ def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     check_jobs(jobs)
     planned = plan_fits(arguments.clouds, arguments.out, config, resume=arguments.resume, force=arguments.force)
     again = command_line("fit", *arguments.clouds, "-o", arguments.out, "--jobs", jobs, "--resume")
-    quiet = arguments.quiet or jobs > 1
-    with training(f"to continue: {again}", quiet=quiet, at_any_time=True) as show:
+    with training(f"to continue: {again}", quiet=arguments.quiet or jobs > 1, at_any_time=True) as show:
         outcomes = fit_many(
             planned,
             arguments.out,

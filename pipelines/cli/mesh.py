@@ -29,8 +29,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     add("--crs", metavar="NAME", help=what)
     add_flags(parser, "--resolution", help="cells per side (256, up to 1024 where parts are thin)")
     add_flags(parser, "--normal-level", help="normals of this level on the mesh (default: of its own)")
-    what = "leave out the colours of the run's texture"
-    add("--no-colors", dest="colors", action="store_false", help=what)
+    add("--no-colors", dest="colors", action="store_false", help="leave out the colours of the run's texture")
     what = "unwrap, and bake colours and fine normals into N × N images (.glb, .obj; needs mplicits[texture])"
     add("--texture", type=whole(16, 16384), metavar="N", help=what)
     add("--texture-faces", type=whole(4), metavar="N", help="triangles to keep with --texture (50000)")
@@ -64,9 +63,8 @@ def _mesh(arguments: argparse.Namespace) -> int:
     if arguments.json and options.report is None and options.texture is None:
         options = dataclasses.replace(options, report=True)
     done = export_run(arguments.run, arguments.out, options, say=print)
-    seconds = time.monotonic() - started
     counts = f"{len(done.mesh.vertices):,} vertices, {len(done.mesh.faces):,} faces"
-    print(f"{arguments.out}: {counts}, in {seconds:.1f} s")
+    print(f"{arguments.out}: {counts}, in {time.monotonic() - started:.1f} s")
     if done.printing is not None:
         print(format_report(done.printing))
     write_json(arguments.json, done.record())
@@ -151,14 +149,13 @@ PART = "run directory, .safetensors file or closed mesh"
 
 
 def _common_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     add_flags(parser, "--time", "--level")
     add_flags(parser, "--resolution", help="cells per side of the cube around all (256)")
-    what = "keep components that no input points support, too"
-    parser.add_argument("--keep-unsupported", action="store_true", help=what)
+    add("--keep-unsupported", action="store_true", help="keep components that no input points support, too")
     add_flags(parser, "--up", help="the axis that points up in the input; see `mplicits mesh`")
-    what = "of the input, for lengths such as 2mm and for the file; see `mplicits mesh`"
-    parser.add_argument("--unit", choices=UNITS, help=what)
-    parser.add_argument("--center", action="store_true", help="put the middle of the mesh at the origin")
+    add("--unit", choices=UNITS, help="of the input, for lengths such as 2mm and for the file; see `mplicits mesh`")
+    add("--center", action="store_true", help="put the middle of the mesh at the origin")
 
 
 def _make_solid(arguments: argparse.Namespace, make: Callable[..., Made]) -> int:

@@ -42,8 +42,7 @@ def _texture_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "run", "--level")
     what = "points with colours (PLY, NPZ, LAS, ...), or a mesh with a texture or vertex colours (OBJ, GLB, PLY)"
     parser.add_argument("source", metavar="CLOUD|MESH", help=what)
-    what = ".safetensors (default: texture.safetensors beside the field)"
-    add_flags(parser, "--out", required=False, help=what)
+    add_flags(parser, "--out", required=False, help=".safetensors (default: texture.safetensors beside the field)")
     add_begin(parser, "continue an interrupted training, with its settings", "replace a texture that is there already")
     add_settings(parser, TextureConfig)
 
@@ -226,8 +225,7 @@ def _evolve(arguments: argparse.Namespace) -> int:
     from ..training.folder import check_new_run
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
-    scans = {} if arguments.resume else scans_among(config.shapes)
-    if scans:
+    if scans := {} if arguments.resume else scans_among(config.shapes):
         folder, given = directory.with_name(f"{directory.name}-fits"), config.landmarks
         with training("to continue: the same command", quiet=arguments.quiet) as report:
             config = fitted_scans(config, scans, folder, fits, progress=report)

@@ -153,23 +153,21 @@ FORMATS = ("neus", "transforms", "colmap")
 
 
 def _scene_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     what = f"{', '.join(SCENE_NAMES)}; or a mesh, with its texture if an OBJ or glTF file has one"
-    parser.add_argument("name", metavar="NAME|MESH", help=what)
+    add("name", metavar="NAME|MESH", help=what)
     add_flags(parser, "--out", metavar="DIR", help="a folder that is not there yet")
     what = "neus (cameras_sphere.npz), transforms (.json of nerfstudio), or colmap (neus)"
-    parser.add_argument("--format", choices=FORMATS, default="neus", metavar="FORMAT", help=what)
-    parser.add_argument("--views", type=whole(1, 10_000), default=24, metavar="N", help="how many images (24)")
-    what = "images of N × N pixels, or of W × H (64)"
-    parser.add_argument("--size", type=picture_size, default=(64, 64), metavar="N|WxH", help=what)
+    add("--format", choices=FORMATS, default="neus", metavar="FORMAT", help=what)
+    add("--views", type=whole(1, 10_000), default=24, metavar="N", help="how many images (24)")
+    add("--size", type=picture_size, default=(64, 64), metavar="N|WxH", help="images of N × N pixels, or of W × H (64)")
     add_flags(parser, "--samples", type=whole(1, 16), default=3, help="rays per pixel and direction (3)")
-    what = "light the shape by a fixed lamp, instead of the bare paint"
-    parser.add_argument("--shaded", action="store_true", help=what)
-    what = "let the shape reflect the lamp, in a highlight that moves with the eye"
-    parser.add_argument("--glossy", action="store_true", help=what)
+    add("--shaded", action="store_true", help="light the shape by a fixed lamp, instead of the bare paint")
+    add("--glossy", action="store_true", help="let the shape reflect the lamp, in a highlight that moves with the eye")
     what = "write depth maps too, in depths/: what the pixels' centres see, in the units of the cameras"
-    parser.add_argument("--depths", action="store_true", help=what)
+    add("--depths", action="store_true", help=what)
     add_flags(parser, "--seed", help="of the cameras (0)")
-    parser.add_argument("--up", choices=("y", "z"), metavar="{y,z}", help="the axis of a mesh that points up (y)")
+    add("--up", choices=("y", "z"), metavar="{y,z}", help="the axis of a mesh that points up (y)")
 
 
 def _scene(arguments: argparse.Namespace) -> int:
