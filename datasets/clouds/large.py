@@ -6,6 +6,7 @@ surface moves by less than a tenth of the voxel squared times its curvature.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Iterator
@@ -239,8 +240,7 @@ def _along_normals(groups: _Groups) -> Float64:
         first = begins(columns[order], step=1)
         place = np.arange(len(rows))
         place -= np.maximum.accumulate(np.where(first, place, 0))
-        starts = np.flatnonzero(place % MERGE.run == 0)
-        joined.append(np.add.reduceat(groups.sums[rows[order]], starts, axis=0))
+        joined.append(np.add.reduceat(groups.sums[rows[order]], np.flatnonzero(place % MERGE.run == 0), axis=0))
     return np.concatenate(joined)
 
 
@@ -275,12 +275,9 @@ def _without_isolated(groups: _Groups, factor: float) -> _Groups:
     usual = 9 * float(np.median(counts))  # a surface crosses about nine of the 27 voxels around one of its points
     few = np.flatnonzero(counts * factor < usual)
     around = np.zeros(len(few))
-    for x in (-1, 0, 1):
-        for y in (-1, 0, 1):
-            for z in (-1, 0, 1):
-                shifted = voxels.keys[few] + (((x << MERGE.bits) + y) << MERGE.bits) + z
-                at = np.searchsorted(voxels.keys, shifted).clip(max=len(counts) - 1)
-                around += np.where(voxels.keys[at] == shifted, counts[at], 0)
-    isolated = voxels.keys[few[around * factor < usual]]
-    kept = ~np.isin(groups.keys >> 3, isolated)
+    for x, y, z in itertools.product((-1, 0, 1), repeat=3):
+        shifted = voxels.keys[few] + (((x << MERGE.bits) + y) << MERGE.bits) + z
+        at = np.searchsorted(voxels.keys, shifted).clip(max=len(counts) - 1)
+        around += np.where(voxels.keys[at] == shifted, counts[at], 0)
+    kept = ~np.isin(groups.keys >> 3, voxels.keys[few[around * factor < usual]])
     return _Groups(groups.keys[kept], groups.sums[kept])

@@ -42,8 +42,7 @@ class PointCloud:
             raise ValueError(f"points has shape {points.shape}; expected (N, 3)")
         object.__setattr__(self, "points", points)
         for name in ("normals", "colors"):
-            value = getattr(self, name)
-            if value is None:
+            if (value := getattr(self, name)) is None:
                 continue
             value = np.asarray(value, np.float32)
             if value.shape != points.shape:
@@ -125,10 +124,8 @@ def spread(points: Float64, max_points: int, *, steps: int = 12) -> Int64:
     low, high = -20.0, 1.0
     for _ in range(steps):
         middle = (low + high) / 2
-        if cells.count(cells.extent.max() * 2**middle) > max_points:
-            low = middle
-        else:
-            high = middle
+        many = cells.count(cells.extent.max() * 2**middle) > max_points
+        low, high = (middle, high) if many else (low, middle)
     return voxel_representatives(points, float(cells.extent.max()) * 2**high)
 
 

@@ -71,8 +71,7 @@ class DepthCamera:
     def at(self, world_from_camera: Float64) -> Camera:
         """The `Camera` with this lens and a rigid pose ``(4, 4)``."""
         pose = torch.from_numpy(np.asarray(world_from_camera, np.float64))
-        matrix = intrinsics(self.fx, self.fy, self.cx, self.cy)
-        return Camera(matrix, pose, self.width, self.height, self.distortion)
+        return Camera(intrinsics(self.fx, self.fy, self.cx, self.cy), pose, self.width, self.height, self.distortion)
 
     @property
     def pixel_angle(self) -> float:
@@ -113,8 +112,7 @@ def read_intrinsics(path: str | Path, *, size: tuple[int, int] | None = None) ->
         if not isinstance(content, dict):
             raise InputError(f"{path}: expected width, height, fx, fy, cx and cy, or a 3 × 3 matrix; or {fix}")
         fields = _fields({} if size is None else {"width": size[0], "height": size[1]}, content, path)
-    missing = [name for name in _FIELDS if fields.get(name) is None]
-    if missing:
+    if missing := [name for name in _FIELDS if fields.get(name) is None]:
         add = "it" if len(missing) == 1 else "them"
         raise InputError(f"{path}: {', '.join(missing)}: missing; add {add}, or {fix}")
     numbers = {
@@ -153,9 +151,8 @@ def _from_text(text: str, path: Path) -> Any:
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        plain = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
         try:
-            return yaml.safe_load(plain)
+            return yaml.safe_load(re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE))
         except yaml.YAMLError as error:
             reason = " ".join(str(error).split())[:80]
             raise InputError(f"{path}: neither numbers nor YAML ({reason}); give --intrinsics FX FY CX CY") from error

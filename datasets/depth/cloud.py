@@ -213,8 +213,7 @@ def fuse_frames(
         raise InputError("frames: none given; name at least one depth map")
     (cloud, owner), seen_through = pool.joined(), 0
     if len(reports) > 1 and views:
-        others = _other_frames(len(reports), views)
-        votes = partial(_votes, cloud.points, owner, others, tolerance)
+        votes = partial(_votes, cloud.points, owner, _other_frames(len(reports), views), tolerance)
         through = sum(map(votes, count(), frames), np.zeros(len(cloud), np.int64))
         seen_through = int((through > 0).sum())
         cloud = select(cloud, through <= 0)
@@ -293,10 +292,9 @@ def _verdict(points: Float64, frame: RgbdFrame, tolerance: float) -> Int64:
 def _summed(reports: Sequence[DepthReport], *, kept: int, seen_through: int) -> DepthReport:
     """One report of all frames."""
     counts = ("pixels", "without_reading", "out_of_range", "edges", "grazing", "specks")
-    totals = {name: sum(getattr(report, name) for report in reports) for name in counts}
     return dataclasses.replace(
         reports[0],
-        **totals,
+        **{name: sum(getattr(report, name) for report in reports) for name in counts},
         frames=len(reports),
         noise=float(np.median([report.noise for report in reports])),
         smoothing=max(report.smoothing for report in reports),

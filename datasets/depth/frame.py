@@ -163,12 +163,11 @@ def _json_poses(path: Path) -> list[PosedFrame]:
     content = read_json(path)
     content = content if isinstance(content, dict) else {}
     if "frames" in content:
-        placed = ((shot.name, shot.placed) for shot in read_shots(path))
         return [
-            (name, np.full((4, 4), np.nan), None)
-            if camera is None
-            else (name, camera.world_from_camera.numpy(), DepthCamera.from_camera(camera))
-            for name, camera in placed
+            (shot.name, np.full((4, 4), np.nan), None)
+            if (camera := shot.placed) is None
+            else (shot.name, camera.world_from_camera.numpy(), DepthCamera.from_camera(camera))
+            for shot in read_shots(path)
         ]
     found: list[PosedFrame] = []
     if "t_00" in content:  # Polycam

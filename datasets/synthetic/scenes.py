@@ -135,8 +135,7 @@ def _observations(scene: Scene, points: Float64, cameras: Sequence[Camera]) -> N
     directions = away / length[..., None]
     hits = sphere_trace(scene.field, eyes[:, None].expand_as(directions), directions, lipschitz=scene.lipschitz)
     free = (hits.mask & (hits.depth > length - 1e-3)).numpy()
-    framed = np.stack([camera.in_view(points)[2] for camera in cameras])
-    return np.argwhere(free & framed)
+    return np.argwhere(free & np.stack([camera.in_view(points)[2] for camera in cameras]))
 
 
 def render_view(

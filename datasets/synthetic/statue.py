@@ -147,8 +147,7 @@ def _face(p: Tensor) -> Tensor:
 
 def _pupil(p: Tensor) -> Tensor:
     """Distance ``(N,)`` from the line of sight of the nearer eye."""
-    q = torch.stack((p[:, 0].abs() - _EYE[0] - 0.022, p[:, 2] - _EYE[2]), dim=1)
-    return q.norm(dim=1)
+    return torch.stack((p[:, 0].abs() - _EYE[0] - 0.022, p[:, 2] - _EYE[2]), dim=1).norm(dim=1)
 
 
 def _eye(p: Tensor) -> Tensor:

@@ -59,8 +59,7 @@ def read_gltf(path: Path, *, textures: bool = True) -> TexturedMesh:
         if needed:
             raise InputError(f"{path}: the extension {needed[0]} is not read; export it without (or uncompressed)")
         materials: dict[str, Paint] = {}
-        pieces = list(_pieces(document, materials, textures=textures))
-        mesh = _joined(pieces, list(materials.values()), str(path))
+        mesh = _joined(list(_pieces(document, materials, textures=textures)), list(materials.values()), str(path))
     except InputError:
         raise
     except (AttributeError, ValueError, KeyError, IndexError, TypeError, RecursionError, struct.error) as error:
@@ -92,8 +91,7 @@ class _Document:
         whole, length = struct.unpack_from("<I", data, 8)[0], struct.unpack_from("<I", data, 12)[0]
         if len(data) < whole:
             raise InputError(f"{path}: is cut off after {len(data):,} of {whole:,} bytes; copy or export it again")
-        header = json.loads(data[20 : 20 + length])
-        return cls(path, header, data[28 + length :])
+        return cls(path, json.loads(data[20 : 20 + length]), data[28 + length :])
 
     def buffer(self, number: int) -> bytes:
         uri = self.header["buffers"][number].get("uri")
@@ -222,8 +220,7 @@ def _piece(
     key, paint = "", Paint(np.ones((1, 1, 3), np.float32))
     if textures and "material" in primitive:
         material = _base_color(document.header["materials"][primitive["material"]])
-        info = material.get("baseColorTexture")
-        if info is not None:
+        if (info := material.get("baseColorTexture")) is not None:
             uv = _texture_coordinates(document, attributes, info)
         key = json.dumps([info, material.get("baseColorFactor")])
         paint = materials[key] if key in materials else _paint(document, material)

@@ -46,8 +46,7 @@ def read_textured_obj(path: Path) -> TexturedMesh:
     # The last usemtl before a polygon; faces before the first usemtl have the last entry, which is white.
     used = np.searchsorted(name_starts, obj.used_at[triangles[:, 0]]) - 1
     number = {name: k for k, name in enumerate(materials)}
-    unknown = next((name for name in names if name not in number), None)
-    if unknown is not None:
+    if (unknown := next((name for name in names if name not in number), None)) is not None:
         raise InputError(f"{path}: usemtl: no material {unknown!r} in its MTL file; export both again")
     listed = [*materials.values(), _Material()]
     chosen = np.array([*(number[name] for name in names), len(materials)])[used]  # (F,); −1 is the last

@@ -32,8 +32,7 @@ def read_textured(path: str | Path) -> TexturedMesh:
         InputError: the file, a material or an image is missing or damaged, or there are no faces or no colours.
     """
     path = Path(path)
-    reader = TEXTURED_READERS.get(path.suffix.lower())
-    if reader is None:
+    if (reader := TEXTURED_READERS.get(path.suffix.lower())) is None:
         known = ", ".join(TEXTURED_READERS)
         raise InputError(f"{path}: meshes with colours are read from {known}; export it as one of them")
     with readable(path):

@@ -147,11 +147,9 @@ def _posed(
     source: Path, width: int | None, region: Similarity | None, depths: DepthSource, *, allow_missing: bool
 ) -> PosedImages:
     shots = read_shots(source)
-    neus = source.suffix.lower() == ".npz"
-    sphere = read_neus_sphere(source) if neus else None
+    sphere = read_neus_sphere(source) if source.suffix.lower() == ".npz" else None
     points, observations = (read_colmap_points(source) if source.is_dir() else None) or (None, None)
-    maps = find_depth_maps(shots, depths)
-    shots = [replace(shot, depth=path) for shot, path in zip(shots, maps, strict=True)]
+    shots = [replace(shot, depth=path) for shot, path in zip(shots, find_depth_maps(shots, depths), strict=True)]
     files = [[file for file in (shot.image, shot.mask, shot.depth) if file is not None] for shot in shots]
     whole = [shot.placed is not None and all(map(Path.is_file, own)) for shot, own in zip(shots, files, strict=True)]
     if not allow_missing:
@@ -204,8 +202,7 @@ def _check_files(shots: Sequence[Shot]) -> None:
     }
     for kind, fix in fixes.items():
         files = [(shot, file) for shot in shots if (file := getattr(shot, kind)) is not None]
-        missing = [(shot, file) for shot, file in files if not file.is_file()]
-        if missing:
+        if missing := [(shot, file) for shot, file in files if not file.is_file()]:
             shot, file = missing[0]
             more = f" ({len(missing)} of {len(files)} are missing)" if len(missing) > 1 else ""
             raise InputError(f"{shot.named}: no {kind} {file}{more}; {fix}")

@@ -55,7 +55,9 @@ def write_neus(folder: str | Path, images: PosedImages) -> None:
         scale[:3, 3] = images.similarity.center
         matrices: dict[str, Any] = {}
         for index, (name, view) in enumerate(_numbered(images)):
-            matrices[f"world_mat_{index}"] = _projection(view.camera)
+            calibration = np.eye(4)  # K [R | t], with a fourth row (0, 0, 0, 1)
+            calibration[:3, :3] = view.camera.intrinsics.numpy()
+            matrices[f"world_mat_{index}"] = calibration @ np.linalg.inv(view.camera.world_from_camera.numpy())
             matrices[f"scale_mat_{index}"] = scale
             color, mask = view.color_bytes, view.mask_bytes
             _write_png(partial / "image" / name, color)
@@ -143,13 +145,6 @@ def _pose(camera: Camera) -> list[float]:
     camera_from_world = np.linalg.inv(camera.world_from_camera.numpy())
     x, y, z, w = Rotation.from_matrix(camera_from_world[:3, :3]).as_quat(canonical=True).tolist()
     return [w, x, y, z, *camera_from_world[:3, 3].tolist()]
-
-
-def _projection(camera: Camera) -> Float64:
-    """``K [R | t]`` with a fourth row (0, 0, 0, 1)."""
-    calibration = np.eye(4)
-    calibration[:3, :3] = camera.intrinsics.numpy()
-    return calibration @ np.linalg.inv(camera.world_from_camera.numpy())
 
 
 def _numbered(images: PosedImages) -> Iterator[tuple[str, PosedImage]]:

@@ -137,8 +137,7 @@ def outwardness(points: Float64, normals: Float64, *, directions: int = 64, cap:
     taken = max(1, int(cap * len(points)))
     scores = np.empty(directions)
     for index, direction in enumerate(fibonacci_directions(directions)):
-        beyond = np.argpartition(points @ direction, -taken)[-taken:]
-        facing = normals[beyond] @ direction
+        facing = normals[np.argpartition(points @ direction, -taken)[-taken:]] @ direction
         scores[index] = facing.sum() / max(np.abs(facing).sum(), 1e-300)
     return float(scores.mean()), float((scores < 0).mean())
 

@@ -198,9 +198,7 @@ def prepare_cloud(
     _check_enough(len(distinct), cloud, "are left after dropping NaN and duplicates")
 
     given = unit_rows(cloud.normals[distinct]) if cloud.normals is not None and normals != "estimate" else None
-    usable: NDArray[np.bool_] = np.zeros(len(distinct), bool)
-    if given is not None:
-        usable = (given != 0).any(axis=1)
+    usable = np.zeros(len(distinct), bool) if given is None else (given != 0).any(axis=1)
     if normals == "file" and not usable.any():
         raise InputError(f"{cloud.source}: normals: the file has none; use --normals estimate")
     kept, unit, repaired = distinct, None, 0
@@ -283,8 +281,7 @@ def _smoothed(points: Float64, normals: Float64, *, flips: bool = False) -> tupl
     middle = middle_of(points)
     level, sound = noise_level(points - middle, normals), normals
     if level and flips:
-        flipped = inspect_points(points, normals, outliers=False).flipped
-        sound = np.where(flipped[:, None], -normals, normals)
+        sound = np.where(inspect_points(points, normals, outliers=False).flipped[:, None], -normals, normals)
         level = noise_level(points - middle, sound)
     if not level:
         return points, 0.0, 0.0
@@ -331,9 +328,7 @@ def _estimate(
         return np.where((normals * towards).sum(axis=1, keepdims=True) < 0, -normals, normals), 0, "sensor"
     propagated, pieces = orient_normals(points, normals, spread, near)
     oriented = orient_by_winding(points, propagated)
-    if oriented is None:
-        return propagated, pieces, "propagation"
-    return oriented, pieces, "winding"
+    return (propagated, pieces, "propagation") if oriented is None else (oriented, pieces, "winding")
 
 
 def _planes(

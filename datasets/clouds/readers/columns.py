@@ -108,8 +108,7 @@ def choose_layout(table: Table, columns: str | None = None, *, scanner: bool = F
     if columns is not None:
         return _requested(table, columns)
     if table.names is not None:
-        layout = named_layout(table.names)
-        if layout is None:
+        if (layout := named_layout(table.names)) is None:
             listed = ", ".join(table.names[:20])
             raise InputError(
                 f"{table.path}: {table.where}no columns x, y and z among {listed}; name them: --columns x,y,z,-"
@@ -120,8 +119,7 @@ def choose_layout(table: Table, columns: str | None = None, *, scanner: bool = F
 
 def _requested(table: Table, columns: str) -> Layout:
     names = [name.strip() for name in columns.split(",")]
-    layout = named_layout(names)
-    if layout is None:
+    if (layout := named_layout(names)) is None:
         raise InputError(f"--columns {columns}: expected x, y and z among the names, such as x,y,z,nx,ny,nz,r,g,b,-")
     if len(names) != table.width:
         raise InputError(f"{table.path}: {table.where}{table.width} columns, but --columns names {len(names)}")
@@ -226,8 +224,7 @@ def describe_layout(table: Table, layout: Layout, count: int) -> str:
     parts = [f"{count:,} points"]
     parts += [f"{what} from {', '.join(names[k] for k in which)}" for what, which in used.items() if which is not None]
     taken = {*layout.points, *(layout.normals or ()), *(layout.colors or ())}
-    others = [name for k, name in enumerate(names) if k not in taken]
-    if others:
+    if others := [name for k, name in enumerate(names) if k not in taken]:
         parts.append(f"ignored: {', '.join(others[:8])}" + f" and {len(others) - 8} more" * (len(others) > 8))
     return "; ".join([*parts, *table.notes])
 

@@ -111,9 +111,7 @@ def _faces(
     lists = {name.lower(): column for name, column in columns.items() if isinstance(column, _Lists)}
     usual = [lists[name] for name in _INDICES if name in lists]
     found = usual or [column for name, column in lists.items() if "tex" not in name]
-    if not found:
-        return np.empty((0, 3), np.int64)
-    return cut(found[0].lengths, found[0].items.astype(np.int64))
+    return cut(found[0].lengths, found[0].items.astype(np.int64)) if found else np.empty((0, 3), np.int64)
 
 
 def ply_stream(path: Path, columns: str | None = None) -> TableStream | None:
@@ -149,8 +147,7 @@ def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
 def _parse_header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
     if not re.match(rb"ply[ \t]*[\r\n]", data):
         raise InputError(f"{path}: does not start with 'ply', so it is not a PLY file; check its extension")
-    end = re.search(rb"(?<=[\r\n])end_header[ \t]*(\r\n|\n|\r)", data)
-    if end is None:
+    if (end := re.search(rb"(?<=[\r\n])end_header[ \t]*(\r\n|\n|\r)", data)) is None:
         raise InputError(f"{path}: end_header is missing, so the header is cut off; export it again")
     encoding = ""
     elements: list[_Element] = []
@@ -252,8 +249,7 @@ def _decode_uniform(data: bytes, start: int, element: _Element, order: str) -> t
         fields += [(f"{number}#", order + p.length_kind), (f"{number}", order + p.kind, (length,))]
         at += np.dtype(p.length_kind).itemsize + length * np.dtype(p.kind).itemsize
     row = np.dtype(fields)
-    has_lists = any(p.length_kind for p in element.properties)
-    if has_lists and start + row.itemsize * element.count > len(data):
+    if any(p.length_kind for p in element.properties) and start + row.itemsize * element.count > len(data):
         return None
     rows = np.frombuffer(data, row, element.count, start)
     columns: _Columns = {}

@@ -85,8 +85,7 @@ def check_cloud_path(path: str | Path) -> Path:
             raise InputError(f"{path}: is a directory; name the point-cloud file in it")
         if not path.exists():
             raise InputError(f"{path}: no such file; check the path")
-    extension = path.suffix.lower()
-    if extension not in CLOUD_SUFFIXES:
+    if (extension := path.suffix.lower()) not in CLOUD_SUFFIXES:
         known = ", ".join(CLOUD_SUFFIXES)
         nearest = difflib.get_close_matches(extension, CLOUD_SUFFIXES, n=1, cutoff=0.5)
         hint = f"did you mean {nearest[0]}? " if nearest else ""

@@ -54,8 +54,7 @@ def read_text(path: Path, columns: str | None = None) -> PointCloud:
         rows = rows[:, :-1]
         names = next(filter(None, (_names(head, separator, rows.shape[1]) for head in reversed(heads))), None)
     table = Table(path, rows, names, f"line {skipped + 1}: ")
-    scanner = path.suffix.lower() == ".pts" or count
-    return cloud_from(table, choose_layout(table, columns, scanner=scanner))
+    return cloud_from(table, choose_layout(table, columns, scanner=path.suffix.lower() == ".pts" or count))
 
 
 def _dialect(line: str) -> tuple[str | None, str]:
@@ -90,8 +89,7 @@ def numbers(body: str, path: Path, *, first_line: int, what: str) -> NDArray[np.
     try:
         return np.loadtxt(io.StringIO(body), np.float64, comments="#", ndmin=2)
     except ValueError as error:
-        problem = _diagnose(body, first_line, what)
-        raise InputError(f"{path}: {problem or error}; correct or delete it") from error
+        raise InputError(f"{path}: {_diagnose(body, first_line, what) or error}; correct or delete it") from error
 
 
 def _diagnose(body: str, first_line: int, what: str) -> str:
@@ -200,6 +198,5 @@ def read_npz(path: Path, columns: str | None = None) -> PointCloud:
             raise InputError(f"{path}: {name}: shape {array.shape}; expected {first.shape}, one row per point")
         names += parts
         values += list(array.T[:3])
-    notes = (f"ignored arrays: {', '.join(ignored)}",) * bool(ignored)
-    table = Table(path, values, names, notes=notes)
+    table = Table(path, values, names, notes=(f"ignored arrays: {', '.join(ignored)}",) * bool(ignored))
     return cloud_from(table, choose_layout(table, columns))

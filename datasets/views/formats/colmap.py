@@ -62,8 +62,7 @@ class _Pose:
 
 def find_model(folder: Path) -> Path | None:
     """The model with most photographs of ``sparse/*``, or ``sparse`` or the folder itself; None where there is none."""
-    models = find_models(folder)
-    return max(models, key=_count_images, default=None)  # of equal ones the first
+    return max(find_models(folder), key=_count_images, default=None)  # of equal ones the first
 
 
 def find_models(folder: Path) -> list[Path]:
@@ -94,8 +93,7 @@ def read_colmap(model: Path) -> list[Shot]:
     cameras, images = _part(model, "cameras"), _part(model, "images")
     lenses = _binary_lenses(cameras) if cameras.suffix == ".bin" else _text_lenses(cameras)
     poses = _poses(images)
-    folder = _beside(model, IMAGE_FOLDERS)
-    if folder is None:
+    if (folder := _beside(model, IMAGE_FOLDERS)) is None:
         folder = (model.parent.parent if model.parent.name == "sparse" else model.parent) / IMAGE_FOLDERS[0]
     masks = _beside(model, MASK_FOLDERS)
     shots = []
@@ -103,8 +101,7 @@ def read_colmap(model: Path) -> list[Shot]:
         named = f"{images}: {pose.name}"
         if pose.lens not in lenses:
             raise InputError(f"{named}: its camera {pose.lens} is not in {cameras.name}; export both again")
-        lens = lenses[pose.lens]
-        camera = _camera(lens, pose, f"{cameras}: camera {pose.lens}")
+        camera = _camera(lenses[pose.lens], pose, f"{cameras}: camera {pose.lens}")
         mask = None if masks is None else _mask(masks, pose.name)
         shots.append(Shot(pose.name, camera, folder / pose.name, mask, named))
     return shots
@@ -275,8 +272,7 @@ def _binary_lenses(path: Path) -> dict[int, _Lens]:
         number, model, width, height = map(int, records.take("iiQQ"))
         if not 0 <= model < len(models):
             raise InputError(f"{path}: camera {number}: unknown model {model}; run colmap image_undistorter")
-        numbers = records.take(f"{MODELS[models[model]]}d")
-        lenses[number] = _Lens(models[model], width, height, numbers)
+        lenses[number] = _Lens(models[model], width, height, records.take(f"{MODELS[models[model]]}d"))
     return lenses
 
 

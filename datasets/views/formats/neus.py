@@ -95,8 +95,7 @@ def _camera(matrix: NDArray[Any], size: tuple[int, int], named: str) -> Camera |
     )
     calibration = calibration / calibration[2, 2]
     width, height = size
-    skew = abs(calibration[0, 1]) * height / 2 / calibration[1, 1]
-    if skew > MAX_SKEW:
+    if (skew := abs(calibration[0, 1]) * height / 2 / calibration[1, 1]) > MAX_SKEW:
         raise InputError(f"{named}: its pixels are skewed by {skew:.2g} at the image's edge; undistort the images")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.T, eye[:3, 0] / eye[3, 0]

@@ -89,8 +89,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def find_depth_maps(shots: list[Shot], source: DepthSource) -> list[Path | None]:
     """The file of each photograph's depth map, or None; files that the data set names may be missing."""
-    folder = source.folder
-    if folder is None:
+    if (folder := source.folder) is None:
         return [shot.depth for shot in shots]
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; it should hold a depth map for each photograph")

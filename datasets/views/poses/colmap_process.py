@@ -140,8 +140,7 @@ def _progress(database: Path, stage: str, photographs: int, pairs: int, done: in
 
 def film_pairs(count: int) -> int:
     """Number of pairs of ``count`` frames that are 1 to 10, or 16, 32, … frames apart."""
-    steps = {*range(1, OVERLAP + 1), *(2**power for power in range(OVERLAP))}
-    return sum(max(count - step, 0) for step in steps)
+    return sum(max(count - step, 0) for step in {*range(1, OVERLAP + 1), *(2**power for power in range(OVERLAP))})
 
 
 def _rows(database: Path, table: str) -> int:

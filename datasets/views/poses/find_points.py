@@ -73,8 +73,7 @@ def _write_given(source: Path, project: Path) -> None:
     names = sorted(file.name for file in (half / "images").iterdir())  # in the order of the views
     eyes = torch.stack([view.camera.eye for view in images.views]).numpy()
     pairs = neighbours(eyes - np.array(images.similarity.center))
-    lines = "".join(f"{names[a]} {names[b]}\n" for a, b in pairs)
-    (project / PAIRS_FILE).write_text(lines, encoding="utf-8")
+    (project / PAIRS_FILE).write_text("".join(f"{names[a]} {names[b]}\n" for a, b in pairs), encoding="utf-8")
     for name in ("images", "depths"):
         if (half / name).is_dir():
             shutil.rmtree(project / name, ignore_errors=True)
