@@ -231,8 +231,7 @@ def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radian
         InputError: there is no such file, it is damaged, no radiance, or one of another geometry.
     """
     path = Path(path)
-    device = geometry.like.device
-    with _reading(path, _RADIANCE, device) as (header, tensors):
+    with _reading(path, _RADIANCE, geometry.like.device) as (header, tensors):
         _check_geometry(path, header, geometry, _RADIANCE)
         inv_std = float(header["inv_std"])
         if not 0 < inv_std < math.inf or tensors["background"].shape != (3,):
@@ -321,8 +320,7 @@ def _reading(path: Path, kind: _Kind, device: torch.device | str) -> Iterator[tu
         raise InputError(f"{path}: no such file; expected {thing} written by `{command}` ({kind.name})")
     try:
         with safe_open(path, framework="pt") as file:  # it knows few devices by name; torch moves to any
-            header_text = (file.metadata() or {}).get(kind.key)
-            if header_text is None:
+            if (header_text := (file.metadata() or {}).get(kind.key)) is None:
                 raise InputError(f"{path}: a safetensors file, but not {thing}; expected one written by `{command}`")
             header = json.loads(header_text)
             if header["version"] != FILE_VERSION:
@@ -358,8 +356,7 @@ def _restore(path: Path, module: nn.Module, tensors: Mapping[str, Tensor], remed
 def _describe(field: Field) -> dict[str, Any]:
     """The arguments from which `_build` makes an untrained copy."""
     if isinstance(field, MultiscaleSDF):
-        levels = [_describe(level) for level in field.levels]
-        return {"type": "MultiscaleSDF", "taper": field.taper, "levels": levels}
+        return {"type": "MultiscaleSDF", "taper": field.taper, "levels": [_describe(level) for level in field.levels]}
     if isinstance(field, SpaceTimeSDF):
         return {"type": "SpaceTimeSDF", "sdf": _describe(field.sdf)}
     if isinstance(field, EncodedField):

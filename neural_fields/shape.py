@@ -89,9 +89,8 @@ class WorldField:
         ``level`` is that of detail, 0 the coarsest, -1 the finest. ValueError for other shapes, or if there is no such
         level.
         """
-        return self._ask(points, lambda unit: (self.field.value(unit, level=level).double() * self.similarity.scale,))[
-            0
-        ]
+        scale = self.similarity.scale
+        return self._ask(points, lambda unit: (self.field.value(unit, level=level).double() * scale,))[0]
 
     def normals(self, points: Points, *, level: int = -1) -> Points:
         """Unit normals ``(..., 3)`` at ``points`` ``(..., 3)``: the direction in which the distance grows."""
@@ -139,7 +138,10 @@ class WorldField:
         """
         if isinstance(origins, Tensor) != isinstance(directions, Tensor):
             raise ValueError("origins and directions: expected two arrays or two tensors")
-        rays = _broadcast(origins, directions)
+        if isinstance(origins, Tensor):
+            rays: Sequence[Any] = torch.broadcast_tensors(origins, directions)
+        else:
+            rays = np.broadcast_arrays(np.asarray(origins, np.float64), np.asarray(directions, np.float64))
 
         def ask(unit: Tensor, along: Tensor) -> tuple[Tensor, ...]:
             hits = sphere_trace(
@@ -311,11 +313,3 @@ def _placed(shape: WorldField, frame: Similarity) -> Field:
 
 def _unit(gradient: Tensor) -> Tensor:
     return torch.nn.functional.normalize(gradient, dim=-1)
-
-
-def _broadcast(first: Any, second: Any) -> tuple[Any, Any]:
-    if isinstance(first, Tensor):
-        pair = torch.broadcast_tensors(first, second)
-        return pair[0], pair[1]
-    one, other = np.broadcast_arrays(np.asarray(first, np.float64), np.asarray(second, np.float64))
-    return one, other

@@ -66,11 +66,10 @@ class Gated(Field):
             jet = self._jet(x, 0)
             for each in range(1, level + 1):
                 there = reached >= each
-                pairs = zip(self._jet(x, each), jet, strict=True)
                 jet = Jet(
                     *(
                         torch.where(there.reshape(*there.shape, *[1] * (new.ndim - there.ndim)), new, old)
-                        for new, old in pairs
+                        for new, old in zip(self._jet(x, each), jet, strict=True)
                     )
                 )
         return jet

@@ -132,8 +132,7 @@ class Field(nn.Module, ABC):
             ValueError: as in `value`, or ``dims`` is not in 1 … d.
         """
         dims = self.resolve_dims(dims)
-        inputs = [x, *self.parameters()]
-        recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs)
+        recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in [x, *self.parameters()])
         with torch.inference_mode(False), torch.enable_grad():
             y = self.check_points(x).clone()
             y = y if y.requires_grad else y.requires_grad_()

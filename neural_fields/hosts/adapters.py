@@ -144,8 +144,7 @@ class InstantNSRGeometry(Hosted):
                 feature = self._value_features(points)
                 return [feature[..., 0], feature]
             if with_laplace:
-                jet, trace = self._second_jet(points)
-                laplacian = [trace]
+                jet, *laplacian = self._second_jet(points)
             else:
                 jet, laplacian = self._jet(points), []
             gradient = [jet.gradient] if with_grad else []

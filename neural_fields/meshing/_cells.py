@@ -174,8 +174,7 @@ def _loops(case: int) -> list[list[int]]:
             while inside[(j + 1) % 4]:
                 j += 1
             enter = _EDGE_OF[frozenset((face[i - 1], face[i]))]
-            leave = _EDGE_OF[frozenset((face[j % 4], face[(j + 1) % 4]))]
-            follow[enter] = leave
+            follow[enter] = _EDGE_OF[frozenset((face[j % 4], face[(j + 1) % 4]))]
     loops = []
     while follow:
         loop = [next(iter(follow))]
@@ -220,8 +219,7 @@ def cube_tables() -> CubeTables:
         ends[:, b] |= crossed[:, edge]
     cases = [[triangle for loop in _loops(case) for triangle in _cut(loop)] for case in range(256)]
     start = np.concatenate(([0], np.cumsum([len(case) for case in cases])))
-    triangles = np.array([triangle for case in cases for triangle in case])
-    return CubeTables(crossed, ends, start, triangles)
+    return CubeTables(crossed, ends, start, np.array([triangle for case in cases for triangle in case]))
 
 
 _BITS = np.array([1, 2, 4])

@@ -271,8 +271,7 @@ class TextureField(OneLevelField):
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """Colours at ``x`` ``(..., d)`` → ``(..., 3)`` in [0, 1]."""
         rows, inside = self._inside(x, level)
-        found = self._background(rows).index_copy(0, inside, self.colors(rows[inside]))
-        return found.reshape(*x.shape[:-1], 3)
+        return self._background(rows).index_copy(0, inside, self.colors(rows[inside])).reshape(*x.shape[:-1], 3)
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`: value ``(..., 3)``, gradient ``(..., 3, d)``, which is 0 outside the band."""

@@ -74,8 +74,7 @@ class NeusSDF(OneLevelField):
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`."""
         self.resolve_level(level)
-        rows = self.check_points(x).reshape(-1, 3)
-        return self._forward(rows)[0][:, 0].reshape(x.shape[:-1])
+        return self._forward(self.check_points(x).reshape(-1, 3))[0][:, 0].reshape(x.shape[:-1])
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; one sweep back through the layers."""

@@ -79,8 +79,7 @@ class Siren(OneLevelField):
         at_least(0, num_features=num_features)
         positive(omega=omega)
         self.width, self.depth, self.omega, self.num_features = width, depth, float(omega), num_features
-        sizes = [in_dim] + [width] * depth
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise([in_dim] + [width] * depth))
         self.output = nn.Linear(width, 1 + num_features)
         self.units = (1.0, 1.0)
         self._initialise(output_gain, feature_gain)
@@ -143,13 +142,12 @@ class Siren(OneLevelField):
         if is_traced():
             return forward(rows, self.folded())[0][:, :channels]
         parameters = list(self.parameters())
-        if not needs_graph(rows, parameters):
-            choice = choose(rows, width=self.width, depth=self.depth, features=channels - 1)
-            if choice.fused:
-                from ..backend.kernels.packing import packed
-                from ..backend.kernels.siren import siren_value
+        sizes = {"width": self.width, "depth": self.depth, "features": channels - 1}
+        if not needs_graph(rows, parameters) and choose(rows, **sizes).fused:
+            from ..backend.kernels.packing import packed
+            from ..backend.kernels.siren import siren_value
 
-                return siren_value(rows, packed(self))[:, None]
+            return siren_value(rows, packed(self))[:, None]
         parameters = self.folded()
         if needs_graph(rows, parameters):
             return forward(rows, parameters)[0][:, :channels]

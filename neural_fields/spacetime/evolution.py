@@ -73,8 +73,7 @@ def transport(velocity: VectorField, *, extend: bool = False) -> Law:
     """
 
     def rate(jet: SpaceTimeJet) -> Tensor:
-        position = _point_below(jet) if extend else jet.position
-        return -(jet.gradient * velocity(position, jet.time)).sum(dim=-1)
+        return -(jet.gradient * velocity(_point_below(jet) if extend else jet.position, jet.time)).sum(dim=-1)
 
     return Law(rate)
 
@@ -86,8 +85,7 @@ def normal_speed(speed: SpeedField, *, extend: bool = False) -> Law:
     """
 
     def rate(jet: SpaceTimeJet) -> Tensor:
-        position = _point_below(jet) if extend else jet.position
-        return -speed(position, jet.time) * _length(jet.gradient)
+        return -speed(_point_below(jet) if extend else jet.position, jet.time) * _length(jet.gradient)
 
     return Law(rate)
 
@@ -152,8 +150,7 @@ def law_loss(jet: SpaceTimeJet, law: Law, *, eps: float = 1e-4) -> Tensor:
     Its units do not depend on the slope of f, so one weight serves all laws. The slope is not differentiated: a steeper
     field must not count as obeying better.
     """
-    slope = jet.gradient.detach().square().sum(dim=-1)
-    return law.residual(jet).square() / (slope + eps)
+    return law.residual(jet).square() / (jet.gradient.detach().square().sum(dim=-1) + eps)
 
 
 def key_loss(jet: Jet | SpaceTimeJet, target: Jet, *, length: float = 0.05) -> Tensor:
@@ -161,8 +158,7 @@ def key_loss(jet: Jet | SpaceTimeJet, target: Jet, *, length: float = 0.05) -> T
 
     ``length`` ℓ weighs normals: surfaces that agree in a point may drift apart by so much before it counts.
     """
-    value = (jet.value - target.value).square()
-    return value + length**2 * (jet.gradient - target.gradient).square().sum(dim=-1)
+    return (jet.value - target.value).square() + length**2 * (jet.gradient - target.gradient).square().sum(dim=-1)
 
 
 def near_surface(value: Tensor, width: float) -> Tensor:

@@ -102,9 +102,12 @@ def flow(
         >>> bool((there - torch.tensor([[-1.0, 0.0, 0.5]])).abs().max() < 1e-4)
         True
     """
-    start, end = _ends(points, start, end)
+    begin, finish = (torch.as_tensor(t, dtype=points.dtype, device=points.device) for t in (start, end))
+    for name, time in (("start", begin), ("end", finish)):
+        if time.shape not in ((), points.shape[:1]):
+            raise ValueError(f"{name} has shape {tuple(time.shape)}; expected one number, or ({len(points)},)")
     _check_points(points)
-    return integrate_rows(velocity, points, start, end, solver or Solver())
+    return integrate_rows(velocity, points, begin, finish, solver or Solver())
 
 
 class VelocityJet(NamedTuple):
@@ -145,7 +148,10 @@ def trajectories(
     Errors are those of `flow`; ValueError too if the times do not run one way.
     """
     _check_points(points)
-    moments = _moments(times, points)
+    moments = torch.as_tensor(times, dtype=points.dtype, device=points.device)
+    steps = moments.diff()
+    if moments.ndim != 1 or not len(moments) or not (bool((steps > 0).all()) or bool((steps < 0).all())):
+        raise ValueError(f"times={moments.tolist()}: expected at least one number, all increasing or all decreasing")
     path = [points]
     for start, end in itertools.pairwise(moments):
         path.append(integrate_rows(velocity, path[-1], start, end, solver or Solver()))
@@ -228,20 +234,3 @@ def integrate_rows(velocity: VectorField, points: Tensor, start: Tensor, end: Te
 def _check_points(points: Tensor) -> None:
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points has shape {tuple(points.shape)}; expected (N, 3)")
-
-
-def _ends(points: Tensor, start: Tensor | float, end: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Both as tensors, each of one number or of one for each point."""
-    times = tuple(torch.as_tensor(t, dtype=points.dtype, device=points.device) for t in (start, end))
-    for name, time in zip(("start", "end"), times, strict=True):
-        if time.shape not in ((), points.shape[:1]):
-            raise ValueError(f"{name} has shape {tuple(time.shape)}; expected one number, or ({len(points)},)")
-    return times[0], times[1]
-
-
-def _moments(times: Sequence[float] | Tensor, points: Tensor) -> Tensor:
-    moments = torch.as_tensor(times, dtype=points.dtype, device=points.device)
-    steps = moments.diff()
-    if moments.ndim != 1 or not len(moments) or not (bool((steps > 0).all()) or bool((steps < 0).all())):
-        raise ValueError(f"times={moments.tolist()}: expected at least one number, all increasing or all decreasing")
-    return moments

@@ -70,8 +70,7 @@ class RigidMotion:
         return along + angle.cos() * (v - along) + angle.sin() * _cross(axis, v)
 
     def _terms(self, x: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
-        time = torch.as_tensor(t, dtype=x.dtype, device=x.device)
-        return x.new_tensor(self.center), x.new_tensor(self.drift), time
+        return x.new_tensor(self.center), x.new_tensor(self.drift), torch.as_tensor(t, dtype=x.dtype, device=x.device)
 
 
 class Moving(Wrapper):

@@ -50,8 +50,7 @@ class CarriedVelocity:
     @torch.no_grad()
     def _whole(self, points: Tensor, t: float) -> Tensor:
         """(a, b, c) ``(7,)`` at a time; zero without a surface."""
-        still = moment(self.field, t)
-        moved, arrived = project_to_surface(still, points, level=self.level)
+        moved, arrived = project_to_surface(moment(self.field, t), points, level=self.level)
         moved = moved[arrived & (moved.norm(dim=-1) <= BOUNDING_RADIUS)]
         normal, speed = self._normal_speed(moved, moved.new_full((len(moved),), t))
         growth = (normal * moved).sum(dim=-1, keepdim=True)

@@ -253,8 +253,7 @@ def render_samples(
 
     def in_place(values: Tensor) -> Tensor:
         """``(K, …)`` → ``(R, S, …)``, 0 in intervals that were skipped."""
-        shape = (*depths.shape, *values.shape[1:])
-        return (values if rows is None else rows.back(values)).reshape(shape)
+        return (values if rows is None else rows.back(values)).reshape(*depths.shape, *values.shape[1:])
 
     points = gathered(ray_points(origins, directions, depths))  # (K, 3)
     along = gathered(directions[:, None].expand(-1, depths.shape[1], -1))
@@ -314,8 +313,7 @@ def sample_depths(
             more = importance_depths(depths, values, count, sharpness, generator=generator)
             depths, order = torch.cat((depths, more), dim=1).sort(dim=1)
             if index + 1 < sampling.rounds:
-                added = coarsest(ray_points(origins, directions, more))
-                values = torch.cat((values, added), dim=1).gather(1, order)
+                values = torch.cat((values, coarsest(ray_points(origins, directions, more))), dim=1).gather(1, order)
     return torch.cat((near[:, None], depths, far[:, None]), dim=1)
 
 
@@ -360,8 +358,7 @@ def _behind(
     nearest = torch.maximum(far, -(origins * directions).sum(dim=-1))
     depths = outside_depths(nearest, count, generator=generator)
     points = invert_outside(ray_points(origins, directions, depths))
-    along = directions[:, None].expand(-1, count, -1).reshape(-1, 3)
-    density, colors = outside(points.flatten(0, 1), along)
+    density, colors = outside(points.flatten(0, 1), directions[:, None].expand(-1, count, -1).reshape(-1, 3))
     interval = torch.cat((depths.diff(dim=1), depths[:, -1:]), dim=1)
     weights, remaining = transmittance_weights(density.reshape(depths.shape) * interval)
     mixed = composite(weights, colors.reshape(*depths.shape, 3))
