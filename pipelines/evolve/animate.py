@@ -127,19 +127,16 @@ def animate_run(
     if options.shading == "color" and colors is None:
         raise InputError(f"--shading color: {file} has no texture; name a textured run with --colors RUN")
     moving = MovingSurface(file, field, similarity, level, colors, options, progress)
+    frames = film_frames(moving)  # drawn as they are taken, if they are
     if out.suffix.lower() in ANIMATIONS:
-        frames = film_frames(moving)
         write_animation(out, there_and_back(frames) if options.loop else frames, fps=options.fps)
         count = max(2 * options.frames - 2, 1) if options.loop else options.frames
         return f"{count} frames of {options.size[0]}×{options.size[1]}"
     if out.suffix.lower() == SHEET:
-        frames = film_frames(moving)
         moments = [(f"t = {time:.2f}", frame) for time, frame in zip(options.times, frames, strict=True)]
         write_picture(out, contact_sheet(*in_rows(moments, 7)))  # 7 in a row
         return f"{options.frames} moments of {options.size[0]}×{options.size[1]}"
-    if out.suffix:
-        return _write_moving_mesh(out, moving)
-    return _write_series(out, moving)
+    return _write_moving_mesh(out, moving) if out.suffix else _write_series(out, moving)
 
 
 def _transported(
@@ -150,16 +147,11 @@ def _transported(
         return None
     motion = load_motion(file)
     motion = None if motion is None else motion.to(field.like)
-    if options.colors is not None:
-        first = borrowed_colors(options.colors, field, similarity)
-    else:
-        first = start_colors(file, field)
+    first = start_colors(file, field) if options.colors is None else borrowed_colors(options.colors, field, similarity)
     last = None if options.last_colors is None else last_colors(options.last_colors, file, field)
     if first is None and last is not None:
         raise InputError(f"--last-colors: {file} has no colours at the start; name the first shape's run with --colors")
-    if first is None:
-        return None
-    return TransportedColors(field, first, last=last, level=level, motion=motion)
+    return None if first is None else TransportedColors(field, first, last=last, level=level, motion=motion)
 
 
 def last_colors(run: str | Path, file: Path, field: Field) -> Colors:

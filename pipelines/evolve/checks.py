@@ -77,8 +77,7 @@ def end_figures(field: Field, end: End) -> dict[str, Any]:
         "chamfer": None,
         "floor": sum(chamfer(*(points.double().numpy() for points in (end.points, end.others)))),
     }
-    mesh = surface_of(at, resolution=END_RESOLUTION)
-    if mesh is None:
+    if (mesh := surface_of(at, resolution=END_RESOLUTION)) is None:
         return figures | {"ratio": None}
     found, _ = sample_points(mesh, len(end.points), np.random.default_rng(0))
     figures["chamfer"] = sum(chamfer(found, end.others.double().numpy()))
@@ -99,8 +98,7 @@ def slope_figures(field: Field, *, count: int = 20_000, width: float = 0.05) -> 
 def warnings(checks: dict[str, Any]) -> list[str]:
     """What a reader of the figures should know, one line each."""
     found = []
-    empty = [frame["time"] for frame in checks["frames"] if not frame["components"]]
-    if empty:
+    if empty := [frame["time"] for frame in checks["frames"] if not frame["components"]]:
         found.append(
             f"no surface at {len(empty)} of {len(checks['frames'])} times, the first at t = {empty[0]:.3g}; align the "
             "shapes so that they overlap, or train longer"
@@ -137,8 +135,7 @@ def frame_figures(field: Field, time: float, resolution: int) -> dict[str, Any]:
     Its volume in units of the field, its topology, and the mean of ||∇f| − 1| at its vertices; 0 and None without any.
     """
     still, inside, error = TimeSlice(field, time), 0.0, None
-    surface = surface_of(still, resolution=resolution)
-    if surface is not None:
+    if (surface := surface_of(still, resolution=resolution)) is not None:
         slope = value_and_gradient(still, torch.from_numpy(surface.vertices).float())[1].norm(dim=1)
         inside, error = volume(surface), float((slope - 1).abs().mean())
     return {"time": time, "volume": inside, **topology_of(surface)._asdict(), "slope_error": error}

@@ -73,8 +73,7 @@ def match(
     Unbalanced entropic optimal transport (Sinkhorn's iterations in logarithms, Chizat et al. 2018) with a cooling blur;
     T is the mean of what a point is matched with. Landmarks make points near one prefer points near its partner.
     """
-    sides = [_surroundings(shape, seed + index) for index, shape in enumerate((first, second))]
-    (x, n, a), (y, m, b) = sides
+    (x, n, a), (y, m, b) = [_surroundings(shape, seed + index) for index, shape in enumerate((first, second))]
     cost = torch.cdist(x, y).square() + MOTION.normals / 2 * (1 - n @ m.T)
     cost = cost + MOTION.surroundings * torch.cdist(a, b).square() / a.shape[1]
     if landmarks is not None and len(landmarks.before):
@@ -110,8 +109,7 @@ class MotionObjective(Objective):
         config: EvolveConfig,
         generator: torch.Generator,
     ) -> None:
-        rate = warm_cosine(config.motion_rate)
-        super().__init__(velocity, [Group(list(velocity.parameters()), rate)], generator)
+        super().__init__(velocity, [Group(list(velocity.parameters()), warm_cosine(config.motion_rate))], generator)
         self.velocity, self.shapes, self.keys, self.config = velocity, shapes, keys, config
         self.pools = [shape.points(MOTION.pool, config.seed + index) for index, shape in enumerate(shapes)]
         self.landmarks = placed_landmarks(config.landmarks, shapes)
@@ -224,8 +222,7 @@ def carried_samples(
         value = torch.cat([carried.value(part) for part in points.split(MOTION.rows)])
     sure = value.abs() > 1e-3
     positive = value[sure] > 0
-    zero = torch.zeros(len(positive))
-    low, high = torch.where(positive, zero, -math.inf), torch.where(positive, math.inf, zero)
+    low, high = torch.where(positive, 0.0, -math.inf), torch.where(positive, math.inf, 0.0)
     return joined(known), Bounds(points[sure], low, high)
 
 
@@ -251,8 +248,7 @@ def motion_figures(
 ) -> list[dict[str, float]]:
     """Of each way from a key to the next: rms and largest |f| where it ends, and how rigid and even it is."""
     figures = []
-    for index in range(len(keys) - 1):
-        start, end = keys[index], keys[index + 1]
+    for index, (start, end) in enumerate(itertools.pairwise(keys)):
         points = shapes[index].points(5000, 7)
         there = flow(velocity, points, start, end)
         middle = flow(velocity, points, start, (start + end) / 2)

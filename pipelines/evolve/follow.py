@@ -64,8 +64,7 @@ def follow_mesh(
     for index in range(1, len(times)):
         before, time = times[index - 1], times[index]
         still = moment(field, time)
-        now = topology_of(surface_of(still, resolution=TOPOLOGY_RESOLUTION, level=level))
-        if now != shape:
+        if (now := topology_of(surface_of(still, resolution=TOPOLOGY_RESOLUTION, level=level))) != shape:
             raise _lost(name, time, f"it has {now}, after {shape}")
         try:
             moved = flow(velocity, path[-1], before, time, solver=FOLLOW)
@@ -78,9 +77,8 @@ def follow_mesh(
             raise _lost(name, time, f"a vertex is {away:.2g} from it")
         path.append(points)
         normals.append(_normals(still, path[-1], level))
-        share = _folded(path[-1], normals[-1], faces)
         # Triangles that look inward: more of them than this, as a share of the area, and the mesh is folded.
-        if share > 0.02:
+        if (share := _folded(path[-1], normals[-1], faces)) > 0.02:
             raise _lost(name, time, f"{share:.0%} of the mesh has folded over")
         if progress is not None:
             progress(index, len(times) - 1)

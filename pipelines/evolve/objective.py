@@ -79,8 +79,7 @@ class EvolveObjective(Objective):
             rest = Jet(later.value, later.gradient, later.features)
 
         found = Jet(rest.value[: len(known)], rest.gradient[: len(known)], rest.features[: len(known)])
-        target = Jet(known.value, known.gradient, found.features)
-        wrong = key_loss(found, target, length=config.length)
+        wrong = key_loss(found, Jet(known.value, known.gradient, found.features), length=config.length)
         self.sampler.learn(rows, wrong.detach().sqrt())
         terms = {"known": wrong.mean()}
         total = config.data_weights[self.level] * terms["known"]
@@ -119,8 +118,7 @@ class _StillObjective(Objective):
         chosen = torch.randint(len(self.known), (self.config.batch // 2,), generator=self.generator)
         batch = self.known.take(chosen.to(self.known.points.device))
         jet = self.siren.jet(batch.points[:, :3])
-        target = Jet(batch.value, batch.gradient, jet.features)
-        loss = key_loss(jet, target, length=self.config.length).mean()
+        loss = key_loss(jet, Jet(batch.value, batch.gradient, jet.features), length=self.config.length).mean()
         return {"known": loss}, loss
 
 

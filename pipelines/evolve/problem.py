@@ -128,8 +128,7 @@ def _deform(
     placed, region = _together(shapes, config)
     keys = config.key_times()
     motion = motion or learn_motion(placed, keys, config, progress, budget=budget)
-    frames = Keyframes(keys, [shape.field for shape in placed])
-    carried = CarriedKeyframes(frames, motion)
+    carried = CarriedKeyframes(Keyframes(keys, [shape.field for shape in placed]), motion)
     known, bounds, number = _sampled(lambda count: carried_samples(carried, placed, count, config.seed), config, budget)
     ends = tuple(_end(shape, time, config.seed) for shape, time in zip(placed, keys, strict=True))
     similarity, figures = _composed(shapes[0].similarity, region), tuple(motion_figures(motion, placed, keys))
@@ -151,8 +150,7 @@ def _morph(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | Non
         generator, per_shape = torch.Generator().manual_seed(config.seed), -(-count // len(placed))
         known = [known_at(shape, time, per_shape, config.seed, generator) for shape, time in pairs]
         x, t = uniform(count, generator), torch.rand(count, generator=generator)
-        values = torch.stack([values_at(shape.field, x) for shape in placed], dim=1)
-        low, high = between(t, keys, values)
+        low, high = between(t, keys, torch.stack([values_at(shape.field, x) for shape in placed], dim=1))
         bounded = torch.isfinite(low) | torch.isfinite(high)
         return joined(known), Bounds(at_time(x, t)[bounded], CAUTION * low[bounded], CAUTION * high[bounded])
 

@@ -105,8 +105,7 @@ def uniform(count: int, generator: torch.Generator) -> Tensor:
 
 def uniform_spacetime(count: int, generator: torch.Generator) -> Tensor:
     """Points ``(count, 4)`` anywhere in the cube, at any time."""
-    x = uniform(count, generator)
-    return torch.cat((x, torch.rand(count, 1, generator=generator)), dim=1)
+    return torch.cat((uniform(count, generator), torch.rand(count, 1, generator=generator)), dim=1)
 
 
 @torch.no_grad()
@@ -117,9 +116,7 @@ def values_at(field: Field, points: Tensor) -> Tensor:
 
 def joined(parts: Sequence[Known]) -> Known:
     """All samples in one."""
-    columns = zip(*((part.points, part.value, part.gradient) for part in parts), strict=True)
-    points, value, gradient = (torch.cat(column) for column in columns)
-    return Known(points, value, gradient)
+    return Known(*map(torch.cat, zip(*((part.points, part.value, part.gradient) for part in parts), strict=True)))
 
 
 def _first_near(field: Field, points: Tensor, count: int, width: float) -> Tensor:

@@ -68,8 +68,7 @@ def _pairs(config: EvolveConfig, scans: Mapping[str, Mesh], runs: Mapping[str, P
     first = poses[0] if poses else None
     if config.kind != "deform" or len(poses) < 2 or first is None or not len(first.faces):
         return ()
-    same = [pose is not None and np.array_equal(pose.faces, first.faces) for pose in poses]
-    if not all(same):
+    if not all(pose is not None and np.array_equal(pose.faces, first.faces) for pose in poses):
         return ()
     # 400 vertices are landmarks; more say nothing new of a smooth motion.
     chosen = np.sort(np.random.default_rng(0).permutation(np.unique(first.faces))[:400])

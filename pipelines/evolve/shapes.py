@@ -73,8 +73,7 @@ class Placement:
 
     def inverse(self) -> Placement:
         """The way back."""
-        turned = -self.shift @ self.rotation / self.scale
-        return Placement(self.rotation.T, 1 / self.scale, turned)
+        return Placement(self.rotation.T, 1 / self.scale, -self.shift @ self.rotation / self.scale)
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""

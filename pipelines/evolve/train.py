@@ -224,8 +224,7 @@ class _Evolving(Training[EvolveConfig, SpaceTimeSDF]):
 
     def level_share(self, level: int) -> float | None:
         """Seconds for the training of a level, see `Training.share`."""
-        left = self.budget.left()
-        if left is not None:
+        if (left := self.budget.left()) is not None:
             left = max(left - min(self.checking_seconds(), CHECKING_SHARE * left), BUDGET.least_seconds)
         return self.share(level, self.config.steps[: self.config.num_levels], left)
 

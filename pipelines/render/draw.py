@@ -96,8 +96,7 @@ def _field_subject(file: Path, options: RenderOptions) -> Subject:
     panels = [_panel(level, normal_level)]
     if options.levels:
         panels = [_panel(index, index) for index in range(finest + 1)] + ([_panel(0, finest)] if finest else [])
-    colors = colors_of_run(file, field, options.time)
-    subject = subject_of(field, similarity, name=file, panels=panels, colors=colors)
+    subject = subject_of(field, similarity, name=file, panels=panels, colors=colors_of_run(file, field, options.time))
     source = lambda: fitted_cloud(file, metadata, remedy="name it with --reference FILE")  # noqa: E731
     return dataclasses.replace(subject, fitted_to=source)
 
@@ -106,11 +105,10 @@ def subject_of(
     field: Field, similarity: Similarity, *, name: Path, panels: Sequence[Panel], colors: Colors | None = None
 ) -> Subject:
     """A three-dimensional field to draw, evaluated on its own device; ``name`` is for messages."""
-    device = field.like.device
 
     def view(camera: Camera, panel: Panel) -> Seen:
         return trace_view(
-            field, camera, level=panel.level, normal_level=panel.normal_level, colors=colors, device=device
+            field, camera, level=panel.level, normal_level=panel.normal_level, colors=colors, device=field.like.device
         )
 
     return Subject(

@@ -38,10 +38,7 @@ def write_animation(path: str | Path, frames: Iterable[Image], *, fps: float = 3
         raise ValueError(f"{path}: fps={fps}; expected a number > 0")
     checked = _checked(path, frames)
     with whole_file(path) as partial:
-        if suffix == ".mp4":
-            _write_mp4(partial, checked, fps)
-        else:
-            _write_gif(partial, checked, fps)
+        (_write_mp4 if suffix == ".mp4" else _write_gif)(partial, checked, fps)
 
 
 def _checked(path: Path, frames: Iterable[Image]) -> Iterator[Image]:

@@ -49,8 +49,7 @@ def _row(pictures: Sequence[Titled], gap: int, strip: int) -> Image:
         scale = 0.6
         (width, _), _ = cv2.getTextSize(title, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
         scale = min(scale, scale * (image.shape[1] - 2 * gap) / max(width, 1))
-        place = (gap, strip - 14)
-        cv2.putText(tile, title, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (40, 40, 40), 1, cv2.LINE_AA)
+        cv2.putText(tile, title, (gap, strip - 14), cv2.FONT_HERSHEY_SIMPLEX, scale, (40, 40, 40), 1, cv2.LINE_AA)
         tiles.append(tile)
     return np.concatenate(tiles, axis=1)
 

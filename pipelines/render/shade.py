@@ -177,9 +177,7 @@ SCALES = {
 
 def default_shading(*, oriented: bool, colored: bool) -> str:
     """The shading of what has normals, or at least colours, or neither: "lambert", "color" or "depth"."""
-    if oriented:
-        return "lambert"
-    return "color" if colored else "depth"
+    return "lambert" if oriented else "color" if colored else "depth"
 
 
 def shade(
@@ -217,9 +215,7 @@ def shade(
     if values is None:
         values = measure(seen, shading, field=field, level=level, detail=options.detail)
     colors = apply_color_map(values, value_limits(values, shading, options), SCALES[shading])
-    if shading == "depth":
-        return colors
-    return colors * (1 - options.relief * (1 - _facing(seen)))[:, None]
+    return colors if shading == "depth" else colors * (1 - options.relief * (1 - _facing(seen)))[:, None]
 
 
 def measure(seen: Seen, shading: str, *, field: Field | None = None, level: int = -1, detail: float = 4e-3) -> Tensor:

@@ -69,8 +69,7 @@ def slice_run(
     field, similarity, _ = load_field(file)
     if field.in_dim != 3:
         raise InputError(f"{file}: a field of {field.in_dim} coordinates; slices are drawn of fields of 3")
-    level = chosen_level(field, file, options.level)
-    view = _View(file, field, similarity, level, options)
+    view = _View(file, field, similarity, chosen_level(field, file, options.level), options)
     if out.suffix.lower() not in ANIMATIONS:
         offset = view.offset()
         write_picture(out, view.draw(offset))

@@ -140,8 +140,7 @@ def _draw(
     traced = as_levels(field, level)
     shown = traced if normal_level == level else as_levels(field, normal_level)
     drawn = draw(field, traced, shown, setting, view)
-    color = None if colors is None else colors(drawn.position)
-    return Seen((camera.width, camera.height), *drawn, color)
+    return Seen((camera.width, camera.height), *drawn, None if colors is None else colors(drawn.position))
 
 
 @torch.inference_mode()
@@ -179,13 +178,12 @@ def trace_hits(
     if budget is not None:
         return sphere_trace(field, eye, directions, level=level, budget=budget)
     size = pixel_size(camera)
-    near = cone_starts(field, eye, directions, level=level, lipschitz=CONE_LIPSCHITZ)
     return sphere_trace(
         field,
         eye,
         directions,
         level=level,
-        near=near,
+        near=cone_starts(field, eye, directions, level=level, lipschitz=CONE_LIPSCHITZ),
         tolerance=PRECISION.tolerance * size,
         resolution=PRECISION.resolution * size,
     )

@@ -54,8 +54,7 @@ def fill_page(header: Mapping[str, Any], data: bytes, *, live: bool = False) -> 
     script = "\n" + "\n".join(_bare(_source(name)) for name in scripts)
     style = "\n" + _source("style.css")
     boot = "\n" + _bare(_source("boot.js"))
-    policy = POLICY.format(boot=_digest(boot), script=_digest(script), style=_digest(style))
-    policy += LIVE_POLICY if live else ""
+    policy = POLICY.format(boot=_digest(boot), script=_digest(script), style=_digest(style)) + LIVE_POLICY * live
     parts = {
         "POLICY": policy,
         "STYLE": style,

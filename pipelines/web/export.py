@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -127,10 +128,8 @@ def pack(source: str | Path, options: WebOptions | None = None) -> Packed:
         field = _coarse(field, options.levels)
     cloud = None if options.cloud in (None, "auto") else Path(str(options.cloud))
     if options.cloud == "auto" and metadata.get("run", {}).get("cloud"):
-        try:
+        with suppress(InputError):
             cloud = fitted_cloud(file, metadata, remedy="")
-        except InputError:
-            cloud = None
     if cloud is not None and field.in_dim != 3:
         raise InputError(f"--cloud: {file} moves; add --time T, or leave it out")
     name = file.resolve().parent.name if file.name == "field.safetensors" else file.stem
@@ -157,8 +156,7 @@ def pack_field(
     shapes = [] if cloud is None else [distance_cloud(cloud, field, similarity)]
     moving = field if isinstance(field, SpaceTimeSDF) else None
     stills: list[Field] = [field] if moving is None else [moving.at(float(t)) for t in MOMENTS]
-    networks = shader_levels(field if moving is None else moving.sdf)
-    if networks is None:
+    if (networks := shader_levels(field if moving is None else moving.sdf)) is None:
         if moving is not None:
             raise InputError(f"{name}: a page shows only SIRENs at all times; choose one with --time T")
         return pack_shapes([*field_shapes(field, texture), *shapes], similarity, options, name=name)
@@ -255,21 +253,18 @@ def _coarse(field: Field, levels: int) -> Field:
         return SpaceTimeSDF(sdf) if isinstance(sdf, MultiscaleSDF) else field
     if not isinstance(field, MultiscaleSDF) or levels == field.num_levels:
         return field
-    residuals = list(field.levels[1:levels])
-    return MultiscaleSDF(field.base, residuals, field.deltas[: levels - 1], taper=field.taper)
+    return MultiscaleSDF(field.base, list(field.levels[1:levels]), field.deltas[: levels - 1], taper=field.taper)
 
 
 def _outlines(stills: list[Field]) -> list[tuple[Field, NDArray[np.floating]]]:
     """The moments that have a surface, and points of it; raises a NoSurfaceError if none has."""
     found: list[tuple[Field, NDArray[np.floating]]] = []
-    missing: NoSurfaceError | None = None
-    for still in stills:
+    for index, still in enumerate(stills, start=1):
         try:
             found.append((still, traced_part(extract_mesh(still, resolution=FRAME_RESOLUTION, normals=False).vertices)))
-        except NoSurfaceError as error:
-            missing = error
-    if not found and missing is not None:
-        raise missing
+        except NoSurfaceError:
+            if not found and index == len(stills):
+                raise
     return found
 
 

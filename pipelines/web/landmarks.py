@@ -34,8 +34,7 @@ class Pairs:
         """Pack both shapes and the pairs."""
         shapes, names = [], []
         for side, (run, saved) in enumerate(zip(self.runs, self.saved, strict=True)):
-            texture = texture_of(find_field(run), saved.field)
-            mesh = field_shapes(saved.field, texture)[-1]
+            mesh = field_shapes(saved.field, texture_of(find_field(run), saved.field))[-1]
             names.append(Path(run).resolve().stem)
             shapes.append(replace(mesh, name=names[-1], vertices=0.5 * mesh.vertices + self._shift(side)))
         packed = pack_shapes(shapes, Similarity.identity(), WebOptions(up=self.up), name=" and ".join(names))
