@@ -325,8 +325,7 @@ def fitted_cloud(file: Path, metadata: Mapping[str, Any], *, remedy: str) -> Pat
     source, from_run = record.get("cloud"), record.get("cloud_from_run")
     if not source:
         raise InputError(f"{file}: was not fitted to a cloud; {remedy}")
-    places = [Path(source)] + ([] if from_run is None else [file.parent / from_run])
-    for place in places:
+    for place in [Path(source)] + ([] if from_run is None else [file.parent / from_run]):
         if place.is_file():
             return place
     raise InputError(f"{file}: its cloud {source} is not to be found; {remedy}")
@@ -354,8 +353,7 @@ def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
     recovered(path)
     if resume:
         if not (path / STATE_FILE).is_file():
-            finished = (path / FIELD_FILE).is_file()
-            reason = "is finished" if finished else "holds no interrupted run"
+            reason = "is finished" if (path / FIELD_FILE).is_file() else "holds no interrupted run"
             raise InputError(f"{path}: {reason}, so there is nothing to resume; leave out --resume")
         return path
     harmless = {lock_file(path), path / MERGED_FILE}
@@ -409,7 +407,14 @@ class RunFolder:
         if progress.get("generation") != record.get("generation"):  # older runs have none
             raise InputError(f"{self.path}: {RECORD_FILE} and {STATE_FILE} are of two runs; begin again with --force")
         if "config" in progress:
-            _check_unchanged(self.path, record["config"], progress["config"])
+            config, began = record["config"], progress["config"]
+            for name in sorted({*config, *began} - {*MAY_CHANGE}):
+                if config.get(name) != began.get(name):
+                    raise InputError(
+                        f"{self.path / RECORD_FILE}: says {name} {config.get(name)}, but the run began with "
+                        f"{began.get(name)}; put it back (only {' and '.join(MAY_CHANGE)} may change at a resume), or "
+                        "begin again with --force"
+                    )
         return load_config(kind, None, record["config"])
 
     @contextmanager
@@ -509,15 +514,6 @@ def write_texture(run: Path, content: bytes, record: Mapping[str, Any], *, finis
     replace_files(run, files, [texture_state_file(Path(TEXTURE_FILE)).name] * finished)
 
 
-def _check_unchanged(run: Path, config: Mapping[str, Any], began: Mapping[str, Any]) -> None:
-    for name in sorted({*config, *began} - {*MAY_CHANGE}):
-        if config.get(name) != began.get(name):
-            raise InputError(
-                f"{run / RECORD_FILE}: says {name} {config.get(name)}, but the run began with {began.get(name)}; put "
-                f"it back (only {' and '.join(MAY_CHANGE)} may change at a resume), or begin again with --force"
-            )
-
-
 def _generation_in(run: Path) -> object:
     """What tells the run in a directory from any other; None where there is none."""
     recovered(run)
@@ -576,8 +572,7 @@ def read_record(directory: Path) -> dict[str, Any]:
 def state_bytes(tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> bytes:
     """What `load_state` reads: tensors, and JSON."""
     plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    about = {**progress, "checksum": _checksum(plain, progress)}
-    return save(plain, metadata={"progress": json.dumps(about)})
+    return save(plain, metadata={"progress": json.dumps({**progress, "checksum": _checksum(plain, progress)})})
 
 
 def save_state(file: Path, tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> None:

@@ -264,9 +264,8 @@ _version = functools.cache(importlib.metadata.version)  # it reads files, and ev
 
 def environment(device: torch.device) -> dict[str, Any]:
     """What the figures of a run depend on: versions, threads, machine."""
-    names = ("mplicits", "torch", "numpy", "scipy", "safetensors")
     return {
-        "versions": {name: _version(name) for name in names},
+        "versions": {name: _version(name) for name in ("mplicits", "torch", "numpy", "scipy", "safetensors")},
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
         "cpu_count": os.cpu_count(),

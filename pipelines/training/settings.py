@@ -421,9 +421,7 @@ class ReconstructConfig(TrainingSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.starts[0] != 0 or any(
-            not 0 <= b < 1 or b < a for a, b in zip(self.starts, self.starts[1:], strict=False)
-        ):
+        if self.starts[0] != 0 or any(not 0 <= b < 1 or b < a for a, b in itertools.pairwise(self.starts)):
             raise ValueError(f"starts: {self.starts}; expected 0 first, then growing shares below 1")
 
 

@@ -254,8 +254,7 @@ class Trainer(Generic[O]):
                 return False
             terms = self._step()
             self.elapsed = time.monotonic() - start
-            late = time.monotonic() - told > report_seconds
-            if self.step % report_every == 0 or self.fraction >= 1 or late:
+            if self.step % report_every == 0 or self.fraction >= 1 or time.monotonic() - told > report_seconds:
                 read = torch.stack([term.to(precise(device)) for term in terms.values()]).tolist()  # one wait for all
                 self.losses = dict(zip(terms, read, strict=True))
                 report(self.progress)
