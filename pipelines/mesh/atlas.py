@@ -40,8 +40,7 @@ def decimate(vertices: Float64, faces: NDArray[np.integer], count: int) -> tuple
     unit = (vertices - middle) / size
     # How eagerly edges are collapsed, 0 to 10. Above 5 the error doubles and closed meshes come back with holes; below
     # 3 it stops early, with more triangles than asked for.
-    collapsed = fast_simplification.simplify(unit, faces.astype(np.int32), target_count=count, agg=4)
-    points, left = collapsed[0], collapsed[1]
+    points, left = fast_simplification.simplify(unit, faces.astype(np.int32), target_count=count, agg=4)[:2]
     corners = points[left]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     used, index = np.unique(left[area > 0], return_inverse=True)
@@ -108,8 +107,7 @@ def vertex_tangents(vertices: Float64, faces: Int64, uv: Float64, normals: Float
         turning += np.bincount(here, (side * angle)[:, 0], len(vertices))
     tangents = _laid(sums, normals)
     missing = ~tangents.any(axis=1)  # vertices of faces without area only: any direction serves
-    axis = np.eye(3)[np.abs(normals[missing]).argmin(axis=1)]
-    tangents[missing] = _laid(axis, normals[missing])
+    tangents[missing] = _laid(np.eye(3)[np.abs(normals[missing]).argmin(axis=1)], normals[missing])
     return np.concatenate((tangents, np.where(turning < 0, -1.0, 1.0)[:, None]), axis=1)
 
 

@@ -178,10 +178,8 @@ def export_run(
     resolution = chosen_resolution(field, options.resolution, support, level, say)
     with surface_needed(f"{file}: no surface to mesh"):
         mesh = extract_mesh(field, resolution=resolution, level=level)
-    if "region" in metadata.get("run", {}):
-        mesh = in_region(mesh)
-        if mesh is None:
-            raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
+    if "region" in metadata.get("run", {}) and (mesh := in_region(mesh)) is None:
+        raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
     if support is not None and not options.keep_unsupported:
         mesh = without_blobs(mesh, support.points, support.radius, say)
     if support is not None and support.visible:
@@ -198,8 +196,7 @@ def export_run(
         mesh = dataclasses.replace(mesh, normals=_unit_normals(field, mesh, level=normal_level))
         say(decimation.describe(options.unit or "input units"))
     colors = colors_of_run(file, field, options.time) if options.colors else None
-    line = placement.describe(Path(out).suffix)
-    if line is not None:
+    if (line := placement.describe(Path(out).suffix)) is not None:
         say(f"coordinates: {line}")
     if options.texture is not None:
         mapped = field.num_levels - 1 if options.normal_level is None else normal_level

@@ -80,8 +80,7 @@ def plan_mesh(
     if depth and not resume:
         return FitMesh(out, run, cloud, colors and source.color is not None, trim=True)
     points = read_cloud(kept_cloud(run) if depth else cloud, columns=columns).points
-    finite = points[np.isfinite(points).all(axis=1)]
-    check_mesh_path(out, Similarity.to_unit_sphere(finite))
+    check_mesh_path(out, Similarity.to_unit_sphere(points[np.isfinite(points).all(axis=1)]))
     try:
         colored = colors and has_colors(cloud, columns)
     except InputError as error:

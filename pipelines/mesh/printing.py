@@ -85,8 +85,7 @@ def print_report(
     """
     if not len(mesh.faces):
         raise ValueError("mesh: has no faces to report on")
-    vertices = similarity.to_input(mesh.vertices)
-    place, whole = placement.into(suffix, vertices), mesh.merged
+    place, whole = placement.into(suffix, similarity.to_input(mesh.vertices)), mesh.merged
     scale = similarity.scale * place.scale
     # In the coordinates of the field, where no digits are lost far from the origin.
     solid = trimesh.Trimesh(whole.vertices, whole.faces, process=False)

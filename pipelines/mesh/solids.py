@@ -142,8 +142,7 @@ def boolean(
     field = OPERATIONS[operation](*fields, smooth=width / frame.scale)
     if not as_field:
         check_mesh_path(out, frame, centered=options.center)
-    what = f"{operation} of {' and '.join(operand.name for operand in operands)}"
-    mesh = _extracted(field, options, what)
+    mesh = _extracted(field, options, f"{operation} of {' and '.join(operand.name for operand in operands)}")
     if not options.keep_unsupported:
         mesh = _supported(mesh, operands, fields, frame, say)
     if as_field:
@@ -180,13 +179,11 @@ def offset(
         raise InputError(
             f"--by {by}: a wall of {cells:.2f} cells, too few to close; take a thicker one, or --resolution {enough}"
         )
-    shape = _measured(operand, options, say)
-    fields, frame = in_one_frame([shape], margin=max(length, 0.0))
+    fields, frame = in_one_frame([_measured(operand, options, say)], margin=max(length, 0.0))
     check_mesh_path(out, frame, centered=options.center)
     reach = length / frame.scale
     field = Shell(*fields, inside=max(-reach, 0.0), outside=max(reach, 0.0)) if shell else Offset(*fields, by=reach)
-    mesh = _extracted(field, options, f"{operand.name} by {by}", level=0)
-    return _written(out, mesh, frame, options, say)
+    return _written(out, _extracted(field, options, f"{operand.name} by {by}", level=0), frame, options, say)
 
 
 def _read(part: str | Path, options: SolidOptions) -> Operand:
@@ -274,8 +271,7 @@ def _written(
     out: str | Path, mesh: Mesh, frame: Similarity, options: SolidOptions, say: Callable[[str], None] | None
 ) -> Made:
     placement = placement_of(options.up, options.unit, options.center)
-    line = placement.describe(Path(out).suffix)
-    if line is not None and say is not None:
+    if (line := placement.describe(Path(out).suffix)) is not None and say is not None:
         say(f"coordinates: {line}")
     write_mesh(out, mesh, frame, placement)
     return _made(mesh, frame)

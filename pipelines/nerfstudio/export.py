@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ...datasets.cameras import Camera
+from ...datasets.cameras import Camera, intrinsics
 from ...neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError, Similarity
 from ...neural_fields.meshing.mesh import check_mesh_path
 from ..mesh.bake import check_texture_size, textured_mesh
@@ -111,8 +111,7 @@ def _textured(path: Path, mesh: Mesh, field: NerfstudioField, move: Move, size: 
     def normals_at(points: Float64) -> NDArray[np.float64]:
         return normals_near(field.field, _moved(points, *move) * field.scale, level=level) @ rotation
 
-    identity = Similarity((0.0, 0.0, 0.0), 1.0)
-    return textured_mesh(path, mesh, identity, colors_at, normals_at, size=size, faces=faces)
+    return textured_mesh(path, mesh, Similarity.identity(), colors_at, normals_at, size=size, faces=faces)
 
 
 @torch.no_grad()
@@ -139,8 +138,7 @@ def host_cameras(cameras: Any) -> list[Camera]:
         world_from_camera[:3] = pose * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
         left, _, right = torch.linalg.svd(world_from_camera[:3, :3])  # its float32 axes are at right angles to 1e-6
         world_from_camera[:3, :3] = left @ right
-        intrinsics = torch.tensor([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]], dtype=torch.float64)
-        found.append(Camera(intrinsics, world_from_camera, int(width), int(height)))
+        found.append(Camera(intrinsics(fx, fy, cx - 0.5, cy - 0.5), world_from_camera, int(width), int(height)))
     return found
 
 

@@ -300,11 +300,9 @@ def _placement(eyes: Float64, forward: Float64, middle: NDArray[np.bool_]) -> It
             "where their axes meet; is the file in OpenGL or OpenCV convention?"
         )
         return
-    inside = int((distance < 1).sum())
-    if inside:
+    if inside := int((distance < 1).sum()):
         yield f"{inside} of {count} cameras stand inside the region of interest; is the region right?"
-    missing = int((~middle).sum())
-    if missing > LIMITS.out_of_view * count:
+    if (missing := int((~middle).sum())) > LIMITS.out_of_view * count:
         yield f"the middle of the region of interest is out of view in {missing} of {count}; is the region right?"
 
 
@@ -372,8 +370,7 @@ def _exposure(views: Sequence[PosedImage]) -> Iterator[str]:
     light = np.array([_brightness(view) for view in views])
     usual = np.median(light)
     far = (light > LIMITS.exposure * usual) | (LIMITS.exposure * light < usual)
-    odd = [view.name for view, is_odd in zip(views, far, strict=True) if is_odd]
-    if odd:
+    if odd := [view.name for view, is_odd in zip(views, far, strict=True) if is_odd]:
         yield f"{len(odd)} of {len(views)} images are two stops or more off the others' brightness: {named(odd)}"
 
 

@@ -123,8 +123,7 @@ def _wire_sphere(*, meridians: int = 6, parallels: int = 5, sides: int = 64) -> 
 
 def _tubes(segments: Float64, radius: float, color: Rgb | Float64) -> Mesh:
     """Three-sided tubes along segments ``(S, 2, 3)``, closed at both ends."""
-    tubes = [_painted(trimesh.creation.cylinder(radius, segment=ends, sections=3), color) for ends in segments]
-    return joined(tubes)
+    return joined([_painted(trimesh.creation.cylinder(radius, segment=ends, sections=3), color) for ends in segments])
 
 
 def _octahedra(points: Float64, radius: float, color: Rgb) -> Mesh:

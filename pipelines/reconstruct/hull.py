@@ -221,8 +221,7 @@ def free_space(measured: MeasuredDepths, resolution: int, *, rays: int = 1 << 18
         depths = near[:, None] + steps
         # Not the last cell and a half: that is where the surface is, as well as it was measured.
         kept = depths < torch.minimum(reach - 1.5 * edge, far)[:, None]
-        places = origins[:, None] + depths[..., None] * directions[:, None]
-        cells = _cell(places, resolution)
+        cells = _cell(origins[:, None] + depths[..., None] * directions[:, None], resolution)
         # Half-cell steps meet a cell more than once; a ray counts once.
         first = torch.ones_like(kept)
         first[:, 1:] = cells[:, 1:] != cells[:, :-1]
@@ -287,8 +286,7 @@ def begin(
     if config.start != "sphere" and isinstance(base, Siren) and (masked or carving is not None):
         empty = None if carving is None else free_space(carving, HULL.resolution).numpy()
         carved = (agreement or Agreement.of(views, images.similarity)).trusted() if masked else ()
-        distances = carve(carved, images.similarity, empty=empty)
-        if distances is not None:
+        if (distances := carve(carved, images.similarity, empty=empty)) is not None:
             start_at_hull(base, distances, seed=config.seed)
             return "hull" if masked else "depths"
     if config.start in ("hull", "depths"):

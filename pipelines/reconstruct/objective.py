@@ -166,8 +166,7 @@ class SceneObjective(Objective):
         self.done = done
         self.sampler.at_step(step, self.kept)
         self.refresh_grid(step, done)
-        measured = self.measured
-        if measured is not None:
+        if (measured := self.measured) is not None:
             measured.affine = self.kept["affine"]  # that of a run which is resumed
             if measured.is_loose and done < self.schedule.faded and step % self.schedule.align_every == 0:
                 measured.align(self.grid or (lambda x: self.model.geometry.value(x, level=0)))

@@ -20,7 +20,7 @@ from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import Field, InputError, Jet, NoSurfaceError, TextureField, extract_mesh
 from ...neural_fields.backend.devices import choose_device
 from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
-from ..render.picture import Image, picture_bytes
+from ..render.picture import picture_bytes
 from ..surface.surface import in_region, sample_points, thinned
 from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
 from ..training.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
@@ -183,8 +183,7 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
 
         The surface's part of that cannot be shortened; held-out views and the texture can.
         """
-        left = self.budget.left()
-        if left is None:
+        if (left := self.budget.left()) is None:
             return None
         self.reserved = min(self.surface_seconds(), FINISH.surface_share * left)
         after = min(self.picture_seconds(left), FINISH.after_share * left)
@@ -248,20 +247,17 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
                 self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), visible_within=within))
         self.model.cpu()
         texture, record["texture"] = self._texture()
-        out = self.folder.out
         if texture is not None:
             self.folder.keep(TEXTURE_FILE, texture_bytes(texture, metadata={"texture": record["texture"]}))
         about = {name: getattr(self.config, name) for name in ("uniform", "importance", "march_grid")}
         content = radiance_bytes(self.model.radiance(), self.model.geometry, metadata={"sampling": about})
         self.folder.keep(RADIANCE_FILE, content)
         if pairs:
-            self.folder.keep(HELD_OUT_FILE, picture_bytes(self._sheet(pairs[: FINISH.sheet_views])))
+            sheet = comparison_sheet(pairs[: FINISH.sheet_views], self.model.background)
+            self.folder.keep(HELD_OUT_FILE, picture_bytes(sheet))
         record = self.folder.finish(self.model.geometry, self.images.similarity, record)
         model, images = self.model.cpu(), self.images
-        return Reconstruction(model.geometry, images.similarity, out, record, model, texture, images)
-
-    def _sheet(self, pairs: Sequence[tuple[PosedImage, ViewImage]]) -> Image:
-        return comparison_sheet(pairs, self.model.background)
+        return Reconstruction(model.geometry, images.similarity, self.folder.out, record, model, texture, images)
 
     def _image(self, view: PosedImage) -> ViewImage:
         """A view as all levels show it."""
@@ -374,8 +370,7 @@ def surface_colors(model: SceneModel, points: Tensor, eyes: Tensor) -> Tensor:
         facing = -(along * normal[:, None]).sum(dim=-1) >= FINISH.facing
         # The first of the cameras that face a point: they count the more, the earlier they come.
         count = min(FINISH.most_views, len(eyes))
-        rank = torch.arange(len(eyes), 0, -1, device=part.device) * facing
-        ranks, chosen = rank.topk(count, dim=1)
+        ranks, chosen = (torch.arange(len(eyes), 0, -1, device=part.device) * facing).topk(count, dim=1)
         directions = along.gather(1, chosen[:, :, None].expand(-1, -1, 3))
         row, view = (ranks > 0).nonzero(as_tuple=True)
         colors = part.new_full((len(part), count, 3), torch.nan)

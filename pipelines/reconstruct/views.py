@@ -169,8 +169,7 @@ def visible_points(field: Field, views: Sequence[MaskedCamera]) -> tuple[Tensor,
         if mask is not None:
             traced = torch.from_numpy(shrink(unit_range(mask), camera.width, camera.height) > OBJECT)
         rays = directions[traced.to(directions.device)].to(field.like)
-        eyes = eye.to(rays).expand_as(rays)
-        hits = sphere_trace(field, eyes, rays, tolerance=1e-3, resolution=1e-3, radius=1.0)
+        hits = sphere_trace(field, eye.to(rays).expand_as(rays), rays, tolerance=1e-3, resolution=1e-3, radius=1.0)
         points.append(hits.position[hits.mask].cpu().double())
         owners.append(torch.full((len(points[-1]),), number))
         pitches.append(hits.depth[hits.mask].cpu().double() / float(camera.intrinsics[0, 0]))

@@ -56,8 +56,7 @@ def from_cloud(cloud: PointCloud) -> Mesh:
     finite = np.isfinite(cloud.points).all(axis=1)
     normals = colors = None
     if cloud.normals is not None:
-        normals = np.nan_to_num(cloud.normals[finite].astype(np.float64), posinf=0.0, neginf=0.0)
-        normals = unit_rows(normals)
+        normals = unit_rows(np.nan_to_num(cloud.normals[finite].astype(np.float64), posinf=0.0, neginf=0.0))
     if cloud.colors is not None:
         colors = cloud.colors[finite].astype(np.float64)
     return Mesh(cloud.points[finite], np.empty((0, 3), np.int64), normals, colors)

@@ -92,8 +92,7 @@ def shape_colors(flag: str, run: str | Path, geometry: Field, field: Field, time
     if texture is None:
         raise InputError(f"{flag} {run}: has no texture; make one with `mplicits texture {run} COLORS`")
     colors = texture_colors(texture)
-    mesh = surface_of(moment(field, time), resolution=TRANSPORT.checked)
-    if mesh is not None:
+    if (mesh := surface_of(moment(field, time), resolution=TRANSPORT.checked)) is not None:
         points = home(torch.from_numpy(mesh.vertices).to(field.like))
         points = points[points.norm(dim=-1) < 1]  # what the texture's fit says elsewhere is no surface of anything
         if not len(points) or float(geometry.value(points).abs().mean()) > TRANSPORT.astray:
@@ -121,8 +120,7 @@ class TransportedPoints:
         """
         if time == to:
             return lambda points: points
-        motion = self._motion
-        if motion is not None:
+        if (motion := self._motion) is not None:
             return lambda points: torch.cat(
                 [
                     flow(motion, part, time, to, solver=Solver("rk4", step=TRANSPORT.learned_step))
