@@ -20,7 +20,7 @@ from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss,
 from ..training.settings import EvolveConfig, FitConfig
 from ..training.trainer import Group, Objective, seeded, warm_cosine, without_prefix
 from .cloud import drawn
-from .samples import LEAST, SQUARES, RobustScales, Samples, Source, at_feet, with_previous
+from .samples import LEAST, SQUARES, RobustScales, Samples, Source, at_feet, value_and_gradient, with_previous
 
 
 @dataclass(frozen=True)
@@ -180,6 +180,7 @@ class Verdict(NamedTuple):
     learnt: float = 1.0  # root mean square of |f| at the training points over that without the level
     guessed: bool = False  # whether the normals were estimated
     noisy: bool = False  # whether the points, then of estimated normals, have their noise
+    until: int | None = None  # the last of several levels that are judged together, and then not by the loss
 
     @property
     def better(self) -> bool:
@@ -198,6 +199,11 @@ class Verdict(NamedTuple):
         return sound if self.noisy else ((max(self.fall) > JUDGE.surely and sound) or self.learns)
 
     @property
+    def unsettled(self) -> bool:
+        """Whether one error is significantly less and the other more, so that the next level decides, see `better`."""
+        return max(self.fall) > JUDGE.surely and not (self.better or self.noisy)
+
+    @property
     def learns(self) -> bool:
         """Whether both errors are less, and that at the points the level was trained on is less by far."""
         return min(self.fall) > 0 and self.learnt < JUDGE.learnt
@@ -214,10 +220,12 @@ class Verdict(NamedTuple):
         pairs = zip(before, after, self.fall, (scale, 1.0), strict=True)
         distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}{{}} ({_sure(fall)})" for b, a, fall, unit in pairs)
         errors = f"mean distance {distance.format('')}, mean angle of the normals {angle.format('°')}"
-        errors += f", loss {self.before.loss:.3g} → {self.after.loss:.3g}"
+        which, it = (f"level {level}", "it") if self.until is None else (f"levels {level} to {self.until}", "them")
+        if self.until is None:
+            errors += f", loss {self.before.loss:.3g} → {self.after.loss:.3g}"
         if not self.noisy and self.learns and max(self.fall) <= JUDGE.surely:
             errors += f"; at the points it was trained on the root mean square is {self.learnt:.2f} of what it was"
-        return f"level {level} {judged}: without it → with it, at {self.points:,} points held out: {errors}"
+        return f"{which} {judged}: without {it} → with {it}, at {self.points:,} points held out: {errors}"
 
     def record(self, level: int, *, scale: float = 1.0) -> dict[str, Any]:
         """For ``run.json``, with distances in input units and angles in degrees."""
@@ -301,6 +309,10 @@ class Judge:
         assert gradient is not None
         jet = siren.jet(self.samples.points)
         return self._errors(value + jet.value, gradient + jet.gradient)
+
+    def errors_of(self, field: Field) -> Each:
+        """Errors of a field that has more levels than those before; points must not be `noisy`."""
+        return self._errors(*value_and_gradient(field, self.samples.points))
 
     def score(self, error: Error) -> float:
         """What the best weights have least of: the loss, or the distance where normals were estimated."""

@@ -35,6 +35,7 @@ class SampleOptions:
     guessed_slope: float = 0.2
     left: float = 0.4  # part of the noise that smoothing leaves without normals: median on six shapes with 0.5 and 1 %
     clear: float = 4.0  # distance to all points, in spacings, from which on a place is not between them
+    right: float = 0.1  # error of a clear place in units of the mean one, with which it is drawn if it has none
     fewest: int = 32  # off-surface samples, below which they get no share of the batch
 
 
@@ -56,6 +57,11 @@ class Rows:
     def to(self, device: torch.device) -> Self:
         """The same rows on another device."""
         return self._each(lambda column: column.to(device))
+
+    def joined(self, other: Self) -> Self:
+        """These rows and those of ``other``, which has the same columns."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return type(self)(*(None if one is None else torch.cat((one, two)) for one, two in pairs))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Self:
         return type(self)(*(None if column is None else change(column) for column in vars(self).values()))
@@ -171,7 +177,9 @@ def banded_sources(
     sources = [Source(kind, samples, third, *terms, scales) for kind, samples in kept.items()]
     # A generator of its own, so that the search leaves the fit of a cloud without such samples unchanged.
     own = torch.Generator().manual_seed(generator.initial_seed() + 1)
-    found = off_surface_samples(index, previous, delta, config.samples, generator=own, device=device, options=options)
+    found = off_surface_samples(
+        index, previous, kept["band"], delta, config.samples, generator=own, device=device, options=options
+    )
     for kind, samples in found._asdict().items():
         if len(samples) >= options.fewest:
             sources.append(Source(kind, samples, third // 4, terms[0], 0.0, 0.0))
@@ -217,7 +225,7 @@ def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Gener
 class OffSurface(NamedTuple):
     """Samples of a band far from every point of the cloud, see `off_surface_samples`; field names are source names."""
 
-    empty: Samples  # clearly inside or outside
+    clear: Samples  # surely inside or outside
     unseen: Samples  # of uncertain sign
 
 
@@ -225,6 +233,7 @@ class OffSurface(NamedTuple):
 def off_surface_samples(
     cloud: CloudDistance,
     field: Field,
+    band: Samples,
     delta: float,
     count: int,
     *,
@@ -234,32 +243,39 @@ def off_surface_samples(
 ) -> OffSurface:
     """Samples of the band around ``field`` that are far from every point of the cloud; often none.
 
-    ``empty``: the winding number is clear, so the level before has a spurious surface there. Their distance is that to
-    the nearest point, up to ±2δ, which takes them out of the next band. ``unseen``: the winding number is uncertain,
-    as in holes of scans; they keep the value of the level before. ``count`` points are tried, spread as for level 0,
-    and as many again around unseen ones.
+    ``clear``: the winding number is clear. Their distance is that to the nearest point, up to ±2δ. Without them a level
+    that cannot resolve a thin part closes a volume around it. They are drawn in proportion to the error of the level
+    before, and to the share `right` of the mean error. ``unseen``: the winding number is uncertain, as in holes of
+    scans, and no point is as near as the surface of the level before; they keep its value. ``count`` points are tried,
+    spread as for level 0, of the samples ``band`` a quarter as many, and ``count`` more around unseen ones.
     """
 
-    def found(tried: Tensor) -> OffSurface:
-        samples = with_previous(Samples(tried), field, delta, device=device)
+    def found(samples: Samples) -> OffSurface:
         points = samples.points.cpu().numpy()
         assert samples.value is not None
         distance, gap = cloud.nearest_gap(points)
-        far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > np.maximum(delta, options.clear * gap))
-        depth = cloud.winding_number(points[far]) - 0.5
+        away = np.flatnonzero(distance > options.clear * gap + CLOUD.chance * cloud.noise)
+        depth = cloud.winding_number(points[away]) - 0.5
         sure = np.abs(depth) > (options.sure_guessed if cloud.guessed else options.sure)
-        empty, unseen = (samples.take(torch.from_numpy(far[some]).to(device)) for some in (sure, ~sure))
-        length = np.minimum(distance[far[sure]], 2 * delta)
-        signed = np.where(depth[sure] > 0, -length, length).astype(np.float32)
-        empty = replace(empty, distance=torch.from_numpy(signed).to(device))
-        return OffSurface(empty, replace(unseen, distance=unseen.value))
+        lost = distance - samples.value.abs().cpu().numpy() > np.maximum(delta, options.clear * gap)
+        unseen = samples.take(torch.from_numpy(away[~sure & lost[away]]).to(device))
+        clear, away, depth = samples.take(torch.from_numpy(away[sure]).to(device)), away[sure], depth[sure]
+        length = np.minimum(distance[away], 2 * delta)
+        signed = torch.from_numpy(np.where(depth > 0, -length, length).astype(np.float32)).to(device)
+        return OffSurface(replace(clear, distance=signed), replace(unseen, distance=unseen.value))
 
-    first = found(spread_points(cloud, count, generator))
+    def placed(points: Tensor) -> Samples:
+        return with_previous(Samples(points), field, delta, device=device)
+
+    first = found(placed(spread_points(cloud, count, generator)).joined(band.take(slice(count // 4))))
+    if len(first.clear):
+        error = (first.clear.value - first.clear.distance).abs()
+        first = first._replace(clear=replace(first.clear, area=error + options.right * error.mean()))
     if len(first.unseen) < options.fewest:
         return first
     seeds = first.unseen.points.cpu()[torch.randint(len(first.unseen), (count,), generator=generator)]
     beside = seeds + (2 * torch.rand(count, 3, generator=generator) - 1) * 2 * delta
-    return OffSurface(first.empty, found(beside.clamp(-DOMAIN, DOMAIN)).unseen)
+    return first._replace(unseen=found(placed(beside.clamp(-DOMAIN, DOMAIN))).unseen)
 
 
 def spread_points(cloud: CloudDistance, count: int, generator: torch.Generator) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.cleaning.winding import DipoleField
-from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
+from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren
 from ...neural_fields.backend.devices import choose_device, peak_memory
 from ..surface.surface import thinned
 from ..training.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
@@ -38,7 +38,17 @@ from .cloud import CloudDistance, Surroundings, load_cloud
 from .densification import dense_distance
 from .level import JUDGE, LEVEL, Judge, LevelObjective, calm_omega, held_out, new_level, noisy_points
 from .review import review_points
-from .samples import DOMAIN, Band, Source, band_of, banded_sources, first_sources, with_wrong_sides
+from .samples import (
+    DOMAIN,
+    SQUARES,
+    Band,
+    RobustScales,
+    Source,
+    band_of,
+    banded_sources,
+    first_sources,
+    with_wrong_sides,
+)
 from .unoriented import Places, Signs, fits_better, give_signs, signed
 
 GUESSED = ("winding", "propagation")  # orientations of estimated normals that may be wrong in whole patches
@@ -205,6 +215,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
                 self.budget.leave_out(level, levels)
                 break
             self.train_level(level, share, flag)
+        self.settle()
         assert self.frozen is not None
         record = self.folder.finish(self.frozen, self.similarity, self.record(finished=True))
         return Run(self.frozen.cpu(), self.similarity, self.folder.out, record)
@@ -272,7 +283,8 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             config = dataclasses.replace(self.config, samples=self.samples)
             siren = new_level(config, level, residual=level > 0, omega=self.omega(level)).to(self.device)
             sources = self.sources(index, delta, config, generator)
-            judge = None if delta is None else self.judge(delta, sources[0])
+            weights = {"data": sources[0].data, "normal": sources[0].normal, "scales": sources[0].scales}
+            judge = None if self.frozen is None or delta is None else self.judge(delta, self.frozen, **weights)
         sampling_seconds = time.monotonic() - started
         seconds = None if share == math.inf else self.training_seconds(level, share - sampling_seconds)
         rate, turn = config.learning_rates[level], config.turn
@@ -287,14 +299,15 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             self.index = None  # residual levels hold points out
         before, self.errors = self.errors, self.values_at_cloud()
         silenced = level > 0 and _rms(self.errors) > LEVEL.worse * _rms(before)
+        on_trial = False
         if verdict is not None:
             seen = ~self.held
             learnt = _rms(self.errors[seen]) / max(_rms(before[seen]), 1e-30)
             verdict = verdict._replace(learnt=learnt)
-            silenced |= not verdict.better
+            on_trial = verdict.unsettled and level + 1 < self.config.num_levels and not self.on_trial
+            silenced |= not (verdict.better or on_trial)
         if silenced:
-            nn.init.zeros_(siren.output.weight)
-            nn.init.zeros_(siren.output.bias)
+            self.silence(siren)
             self.errors = before
         self.stages.append(
             {
@@ -311,15 +324,47 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
                 "steps": trainer.step,
                 "ended_by_time_budget": trainer.ended_early,
                 "silenced": silenced,
+                "on_trial": on_trial and not silenced,
                 "held_out": None if verdict is None else verdict.record(level, scale=self.similarity.scale),
                 "losses": trainer.losses,
                 **({} if review is None else {"review": review}),
                 **self.surface_errors(),
             }
         )
+        if not on_trial:
+            self.settle()
         self.save(self.frozen, None)
         if self.level_done is not None:
             self.level_done(self.frozen, self.similarity)
+
+    @property
+    def on_trial(self) -> dict[str, Any] | None:
+        """The stage of the level that waits for the next one to decide whether both are kept."""
+        return next((stage for stage in self.stages if stage.get("on_trial")), None)
+
+    def settle(self) -> None:
+        """Keep the level on trial if it is better than none with the levels after it, else set them to zero."""
+        stage = self.on_trial
+        if stage is None or self.frozen is None:
+            return
+        number, levels = stage["level"], self.frozen.levels
+        before = MultiscaleSDF(levels[0], levels[1:number], self.frozen.deltas[: number - 1]).to(self.device)
+        judge = self.judge(stage["delta"], before)
+        assert judge is not None  # there was one when the trial began
+        verdict = judge.verdict(judge.errors_of(self.frozen), 1.0)._replace(until=self.frozen.num_levels - 1)
+        stage.update(on_trial=False, silenced=not verdict.better)
+        stage["held_out"] = verdict.record(number, scale=self.similarity.scale)
+        if not verdict.better:
+            for later, siren in zip(self.stages[number:], levels[number:], strict=True):
+                later["silenced"] = True
+                self.silence(siren)
+            self.errors = self.values_at_cloud()
+            self.stages[-1].update(self.surface_errors())
+
+    def silence(self, siren: Any) -> None:
+        """Set a residual to zero."""
+        nn.init.zeros_(siren.output.weight)
+        nn.init.zeros_(siren.output.bias)
 
     def sources(
         self, index: CloudDistance, delta: float | None, config: FitConfig, generator: torch.Generator
@@ -395,19 +440,20 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             band = with_wrong_sides(band, self.errors, self.indexed(level), self.frozen, **about)
         return band.within(self.stages[-1]["delta"], self.errors)
 
-    def judge(self, delta: float, surface: Source) -> Judge | None:
-        """The judge of a residual level, with its loss weights on the surface; None without enough held-out points."""
-        index, noisy = self.indexed(len(self.stages)), self.cloud.noisy
+    def judge(
+        self, delta: float, before: Field, *, data: float = 0.0, normal: float = 0.0, scales: RobustScales = SQUARES
+    ) -> Judge | None:
+        """The judge of levels after those ``before``, with loss weights; None without enough held-out points."""
+        index, noisy = self.indexed(before.num_levels), self.cloud.noisy
         points = self.points[self.held] if noisy is None else torch.from_numpy(noisy)
         if not len(points):
             return None
-        assert self.frozen is not None
         rows = index.nearest_rows(points.numpy())[1]
         normals = self.normals[self.held] if noisy is None else torch.from_numpy(index.normals[rows])
-        terms: dict[str, Any] = {"data": surface.data, "normal": surface.normal, "scales": surface.scales}
-        about = {"spacing": self.spacing, "guessed": self.cloud.estimated, "noisy": noisy is not None}
+        terms: dict[str, Any] = {"data": data, "normal": normal, "scales": scales, "spacing": self.spacing}
+        about = {"guessed": self.cloud.estimated, "noisy": noisy is not None}
         areas = torch.from_numpy(index.gaps[rows]) ** 2
-        judge = Judge(points, normals, self.frozen, delta, areas=areas, **about, **terms)
+        judge = Judge(points, normals, before, delta, areas=areas, **about, **terms)
         return judge if judge.count >= JUDGE.fewest / 2 else None
 
     def review(self) -> dict[str, Any]:

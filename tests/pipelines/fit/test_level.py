@@ -264,6 +264,13 @@ def test_a_level_is_kept_if_it_is_surely_better() -> None:
         assert not any(verdict_of(*falls)._replace(**known).better for falls in silenced)
 
 
+def test_a_level_is_unsettled_if_its_errors_surely_contradict_each_other_and_the_loss() -> None:
+    worse = verdict_of(5.0, -3.0)._replace(after=Error(2.1, 0.002, 3.5))
+    assert worse.unsettled
+    assert not worse._replace(noisy=True, guessed=True).unsettled
+    assert not any(verdict_of(*falls).unsettled for falls in ((5.0, -3.0), (1.5, -3.0), (3.0, 0.0)))
+
+
 def test_noisy_points_judge_by_their_mean_distance_beyond_the_band_too() -> None:
     # Heights uniform in ±h and an error e of the surface have the mean |f| = (h² + e²) / 2h.
     high, x = 2 * OFF, points(1000)
@@ -315,6 +322,9 @@ def test_a_verdict_in_words_and_numbers() -> None:
         "3 → 1.5° (no significant difference)",
     ):
         assert part in words
+    together = verdict._replace(until=2).words(1)
+    assert together.startswith("levels 1 to 2 kept")
+    assert "loss" not in together
     assert "0.70" in verdict_of(1.5, 1.5)._replace(learnt=0.7).words(1)
     record = verdict.record(1, scale=10.0)
     assert (record["before"], record["after"], record["kept"]) == (2, 1, True)

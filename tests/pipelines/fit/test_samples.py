@@ -201,56 +201,57 @@ FAR = 0.02  # of leaves of dipoles, each seen as one
 PHANTOM = Sphere(radius=0.1, center=(0.85, 0.0, 0.0))
 
 
-def empty(cloud: CloudDistance, field: Sphere | Union, delta: float = 0.05) -> module.Samples:
-    return module.off_surface_samples(cloud, field, delta, 40_000, generator=generator(), device=CPU).empty
+def off_surface(cloud: CloudDistance, field: Field, delta: float = 0.05) -> module.OffSurface:
+    """Clear and unseen places of the band around a field."""
+    band = module.band_samples(cloud, delta, 40_000, generator=generator())
+    band = module.with_previous(band, field, delta, device=CPU)
+    return module.off_surface_samples(cloud, field, band, delta, 40_000, generator=generator(), device=CPU)
 
 
-def test_a_sound_level_has_no_empty_places_in_its_band(cloud: CloudDistance) -> None:
-    assert len(empty(cloud, Sphere(radius=RADIUS))) == 0
-    assert len(empty(cloud, Sphere(radius=RADIUS + 0.02))) == 0
+def test_clear_places_have_their_distance_and_are_drawn_by_the_error_there(cloud: CloudDistance) -> None:
+    delta = 0.09  # the gap between points is about 0.015
+    for field in (Sphere(radius=RADIUS), Sphere(radius=RADIUS + 0.02), Union(Sphere(radius=RADIUS), PHANTOM)):
+        found = off_surface(cloud, field, delta).clear
+        assert len(found) > 1000
+        gaps = torch.from_numpy(cloud.nearest_gap(found.points.numpy())[1])
+        exact = found.points.norm(dim=1) - RADIUS
+        assert (exact.abs() > 0.9 * module.SAMPLING.clear * gaps).all()
+        assert torch.allclose(found.distance, exact.clamp(-2 * delta, 2 * delta), atol=5e-3)
+        error = (found.value - found.distance).abs()
+        torch.testing.assert_close(found.area, error + module.SAMPLING.right * error.mean())
+    invented = PHANTOM.value(found.points) < exact - 0.01
+    assert invented.sum() > 30
+    assert found.area[invented].mean() > 5 * found.area[~invented].mean()
     sparse = CloudDistance(*sphere_points(300))  # between its points the band is far from all of them
-    assert len(empty(sparse, Sphere(radius=RADIUS), delta=0.01)) == 0
+    assert len(off_surface(sparse, Sphere(radius=RADIUS), delta=0.01).clear) == 0
 
 
-def test_empty_places_are_where_a_level_invents_a_surface(cloud: CloudDistance) -> None:
-    found = empty(cloud, Union(Sphere(radius=RADIUS), PHANTOM))
-    assert len(found) > 30
-    assert (PHANTOM.value(found.points).abs() < 0.05).all()
-    exact = found.points.norm(dim=1) - RADIUS
-    assert torch.allclose(found.distance, exact.clamp(max=0.1), atol=5e-3)
-    assert (exact - found.value.abs() > 0.045).all()
-
-
-def test_places_in_less_doubt_are_empty_where_normals_are_guesses() -> None:
+def test_places_in_less_doubt_are_clear_where_normals_are_guesses() -> None:
     """In the mouth of a bowl the winding number is between; guesses are believed from 0.2 and 0.8 on."""
     level, found = Sphere(radius=RADIUS), {}
     for guessed in (False, True):
         bowl = sphere_below(0.3, guessed=guessed)
-        found[guessed] = module.off_surface_samples(bowl, level, 0.05, 40_000, generator=generator(), device=CPU)
-        for places, sure in ((found[guessed].empty, True), (found[guessed].unseen, False)):
+        found[guessed] = off_surface(bowl, level)
+        for places, sure in ((found[guessed].clear, True), (found[guessed].unseen, False)):
             depth = np.abs(bowl.winding_number(places.points.numpy()) - 0.5)
             # Which dipoles count one by one depends on the places of one call.
             least = (module.SAMPLING.sure_guessed if guessed else module.SAMPLING.sure) + (-FAR if sure else FAR)
             assert ((depth > least) == sure).all()
-    assert len(found[True].empty) > len(found[False].empty)
+    assert len(found[True].clear) > len(found[False].clear)
     assert len(found[True].unseen) < len(found[False].unseen)
 
 
 def test_a_level_keeps_what_was_not_scanned(cloud: CloudDistance) -> None:
     """In the hole, and only there, more than δ from its rim, with the value of the level before."""
     level, delta = Sphere(radius=RADIUS - 0.01), 0.05
-    assert len(empty(sphere_below(0.8), Sphere(radius=RADIUS))) == 0
-    found = module.off_surface_samples(
-        sphere_below(0.8), level, delta, 40_000, generator=generator(), device=CPU
-    ).unseen
+    found = off_surface(sphere_below(0.8), level, delta).unseen
     assert len(found) > 1000
     assert torch.equal(found.distance, level.value(found.points))
     up = found.points[:, 2] / found.points.norm(dim=1)
     rim = np.cos(np.arccos(0.8) - np.arcsin(delta / (RADIUS + delta)))  # δ away from it, outside at the most
     assert (up > rim - 0.01).all()
     assert up.max() > 0.999
-    whole = module.off_surface_samples(cloud, level, delta, 40_000, generator=generator(), device=CPU)
-    assert len(whole.unseen) == len(whole.empty) == 0
+    assert len(off_surface(cloud, level, delta).unseen) == 0
 
 
 def with_next_level(cloud: CloudDistance, previous: MultiscaleSDF, omega: float, steps: int) -> tuple[list[str], Field]:
@@ -270,7 +271,7 @@ def test_the_next_level_leaves_the_closing_of_a_hole_as_it_is() -> None:
         MultiscaleSDF(Sphere(radius=RADIUS + 0.02), [], []),
     )  # off by 0.02 at the points
     names, field = with_next_level(cloud, previous, 40.0, 100)
-    assert names == ["surface", "offset", "band", "unseen"]
+    assert names == ["surface", "offset", "band", "clear", "unseen"]
     aside = torch.nn.functional.normalize(torch.randn(500, 2, generator=generator()), dim=1)
     cap = torch.cat((0.2 * torch.rand(500, 1) * aside, torch.ones(500, 1)), dim=1)
     cap = torch.nn.functional.normalize(cap, dim=1)
@@ -281,7 +282,7 @@ def test_the_next_level_leaves_the_closing_of_a_hole_as_it_is() -> None:
 def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> None:
     previous = MultiscaleSDF(Union(Sphere(radius=RADIUS), PHANTOM), [], [])
     names, field = with_next_level(cloud, previous, 20.0, 150)
-    assert names == ["surface", "offset", "band", "empty"]
+    assert names == ["surface", "offset", "band", "clear"]
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator()), dim=1)
     shell = torch.tensor([0.85, 0.0, 0.0]) + 0.1 * directions
     outside = shell[shell.norm(dim=1) > RADIUS + 0.1]

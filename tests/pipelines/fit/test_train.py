@@ -16,7 +16,7 @@ from mplicits.neural_fields import InputError, extract_mesh, load_field
 from mplicits.neural_fields.backend.devices import choose_device
 from mplicits.pipelines.cli.fit import describe
 from mplicits.pipelines.fit import FitConfig, Interrupted, fit
-from mplicits.pipelines.fit.level import JUDGE, LEVEL, calm_omega
+from mplicits.pipelines.fit.level import JUDGE, LEVEL, Verdict, calm_omega
 from mplicits.pipelines.training.folder import read_record
 
 CENTER = np.array([1000.0, -50.0, 5.0])
@@ -131,6 +131,31 @@ def test_a_level_that_is_worse_than_none_adds_nothing(fitted: Path, tmp_path: Pa
     assert torch.equal(run.field.jet(x).gradient, run.field.jet(x, level=0).gradient)
     assert "level 1 set to zero: further from the points" in describe(tmp_path / "run")
     assert not any(stage["silenced"] for stage in read_record(fitted)["stages"])
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_level_on_trial_is_kept_or_set_to_zero_with_the_next(
+    together: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Verdict, "better", property(lambda verdict: verdict.until == 2 and together))
+    monkeypatch.setattr(Verdict, "unsettled", property(lambda verdict: verdict.until is None))
+    levels = {"widths": (24, 24, 24), "depths": (1, 1, 1), "omegas": (8.0, 16.0, 32.0)}
+    config = replace(SMALL, **levels, steps=(60, 30, 80), learning_rates=(3e-3, 1e-3, 3e-4), hold_out=0.05)
+    run = fit(sphere_cloud(5000), config, out=tmp_path / "whole")
+    _, first, second = run.record["stages"]
+    assert (first["on_trial"], first["silenced"], second["silenced"]) == (False, not together, True)
+    assert f"levels 1 to 2 {'kept' if together else 'set to zero'}" in describe(tmp_path / "whole")
+    x = 2 * torch.rand(2000, 3) - 1
+    assert torch.equal(run.field.value(x), run.field.value(x, level=1))  # level 2 is no better than level 1
+    assert torch.equal(run.field.value(x), run.field.value(x, level=0)) is not together
+    points = torch.from_numpy(run.similarity.to_unit(sphere_cloud(5000).points)).float()
+    rms = float(run.field.value(points).square().mean().sqrt()) * run.similarity.scale
+    assert second["rms_at_points"] == pytest.approx(rms, rel=1e-3)
+    part = tmp_path / "part"
+    with pytest.raises(Interrupted):
+        fit(sphere_cloud(5000), config, out=part, progress=interrupt("level 2", 40))
+    assert read_record(part)["stages"][1]["on_trial"]
+    assert_same(fit(sphere_cloud(5000), out=part, resume=True).field, run.field)
 
 
 def test_a_level_without_a_judge_learns_from_all_points() -> None:
