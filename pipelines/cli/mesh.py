@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..training.settings import given_flags
 from .common import Command, add_flags, positive, refuse, whole, write_json
@@ -25,6 +25,8 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--out", help=f"{', '.join(MESH_FILES)}; with --format 3dtiles a folder")
     what = "3dtiles: 3D Tiles 1.1, a folder of tiles at several steps of detail, for web viewers such as Cesium"
     add("--format", choices=("3dtiles",), help=what)
+    what = "extract and write cube by cube, for a surface that is too large for memory (.ply)"
+    add("--in-parts", action="store_true", help=what)
     what = "coordinate system of the input, for 3D Tiles: EPSG:NUMBER or WKT (default: that of a LAS or LAZ file)"
     add("--crs", metavar="NAME", help=what)
     add_flags(parser, "--resolution", help="cells per side (256, up to 1024 where parts are thin)")
@@ -56,7 +58,7 @@ def _mesh(arguments: argparse.Namespace) -> int:
     from ..mesh.printing import format_report
 
     started = time.monotonic()
-    if arguments.format is not None:
+    if arguments.format is not None or arguments.in_parts:
         return _scene(arguments, started)
     refuse(arguments, ["crs"], "goes with --format 3dtiles; add it, or leave this out")
     options = MeshOptions(**given_flags(arguments, MeshOptions))
@@ -73,19 +75,28 @@ def _mesh(arguments: argparse.Namespace) -> int:
 
 def _scene(arguments: argparse.Namespace, started: float) -> int:
     from ..mesh.extract import MeshOptions
-    from ..mesh.scene import SceneOptions, scene_of_run
+    from ..mesh.scene import SceneOptions, ply_of_run, scene_of_run
     from ..training.progress import progress_bars
 
+    flag = "--in-parts" if arguments.in_parts else "--format 3dtiles"
     others = MeshOptions.__dataclass_fields__.keys() - SceneOptions.__dataclass_fields__.keys()
-    refuse(arguments, sorted(others), "does not go with --format 3dtiles; leave it out")
-    given = given_flags(arguments, SceneOptions)
+    others |= {"crs", "format"} if arguments.in_parts else set()
+    refuse(arguments, sorted(others), f"does not go with {flag}; leave it out")
+    about = (arguments.run, arguments.out, SceneOptions(**given_flags(arguments, SceneOptions)))
     with progress_bars(counting=True) as report:
-        scene = scene_of_run(arguments.run, arguments.out, SceneOptions(**given), say=print, report=report)
-    print(
-        f"{arguments.out}/tileset.json: {scene.tiles:,} tiles in {scene.steps} steps of detail, the coarsest within "
-        f"{scene.error:.3g} m, the finest of {scene.faces:,} faces, in {time.monotonic() - started:.1f} s"
-    )
-    write_json(arguments.json, scene._asdict())
+        if arguments.in_parts:
+            vertices, faces = ply_of_run(*about, say=print, report=report)
+            made: dict[str, Any] = {"vertices": vertices, "faces": faces}
+            line = f": {vertices:,} vertices, {faces:,} faces"
+        else:
+            scene = scene_of_run(*about, say=print, report=report)
+            made = scene._asdict()
+            line = (
+                f"/tileset.json: {scene.tiles:,} tiles in {scene.steps} steps of detail, the coarsest within "
+                f"{scene.error:.3g} m, the finest of {scene.faces:,} faces"
+            )
+    print(f"{arguments.out}{line}, in {time.monotonic() - started:.1f} s")
+    write_json(arguments.json, made)
     return 0
 
 

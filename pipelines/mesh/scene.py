@@ -1,4 +1,4 @@
-"""A surface as 3D Tiles 1.1: cubes of lattices, coarse to fine, each a GLB, and the tree of them for web viewers."""
+"""A surface in cubes of lattices: as one PLY, or as 3D Tiles 1.1, coarse to fine, a tree of GLBs for web viewers."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from scipy.spatial import KDTree
 
 from ...datasets import spacing_of
 from ...datasets.clouds.point_cloud import unit_rows
-from ...neural_fields import InputError, Mesh, Similarity
-from ...neural_fields.backend.files import check_place, partial_of, remove, rename, write_json
+from ...neural_fields import Field, InputError, Mesh, Similarity
+from ...neural_fields.backend.files import check_place, partial_of, remove, rename, whole_file, write_json
 from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing._cells import CORNERS, Bounds
 from ...neural_fields.meshing.extract import DEFAULT_BOUNDS, NoSurfaceError, surface_needed
+from ...neural_fields.meshing.mesh import check_mesh_path, ply_faces, ply_faces_header, ply_vertices
 from ...neural_fields.meshing.parts import Place, extract_parts
 from ..surface.surface import (
     Footing,
@@ -111,44 +112,18 @@ def scene_of_run(
     inside = {path.name for path in out.iterdir()} if out.is_dir() else {"a file"} if out.exists() else set()
     if SCENE_FILE not in inside and inside - {TILES}:
         raise InputError(f"{out}: holds something that is no 3D Tiles scene; name another folder")
-    file = find_field(run)
-    field, similarity, metadata = load_still(file, options.time)
-    record = metadata.get("run", {})
-    level = chosen_level(field, file, options.level)
-    support = None if options.time is not None else read_support(file, record, level)
-    stand = _stand(options, placement, similarity, record, file)
+    source = _Source.of(run, options, say)
+    stand = _stand(options, placement, source.similarity, source.record, source.file)
     say(f"coordinates: {stand.line}")
-    resolution = chosen_resolution(field, options.resolution, support, level, say)
-    bounds, cells, steps = _lattice(support, resolution, options.cells)
-    colors = colors_of_run(file, field, options.time) if options.colors else None
     partial = partial_of(out)
     try:
-        for step in range(steps):
-            folder = partial / PARTS / str(step)
-            folder.mkdir(parents=True)
-            size, used = cells // 2**step, max(0, level - step)
-            show = counted(report or silent, f"tiles of {size} cells per side")
-            # Coarse cells may miss all of a thin surface.
-            with surface_needed(f"{file}: no surface to mesh") if step == 0 else suppress(NoSurfaceError):
-                for part in extract_parts(
-                    field,
-                    resolution=size,
-                    cells=options.cells,
-                    level=used,
-                    bounds=bounds,
-                    progress=lambda _, done, total, show=show: show(done, total),
-                ):
-                    if "region" not in record:
-                        _keep(folder, part.place, part.mesh, part.shared, part.edges)
-                    elif (inside := within_sphere(part.mesh)) is not None:
-                        _keep(folder, part.place, inside, NOTHING, NOTHING)
-            if support is not None and not support.visible and not options.keep_unsupported:
-                _drop_unsupported(folder, support)
+        for step in range(source.steps):
+            source.extract(partial / PARTS / str(step), options, step=step, report=report)
         show, total = counted(report or silent, "writing tiles"), sum(1 for _ in (partial / PARTS).rglob("*.npz"))
-        writer = _Writer(partial, stand, similarity, colors, show, total)
-        root = writer.tile(steps - 1, (0, 0, 0))
+        writer = _Writer(partial, stand, source.similarity, source.colors, show, total)
+        root = writer.tile(source.steps - 1, (0, 0, 0))
         if root is None:
-            raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
+            raise InputError(f"{source.file}: no surface in the region of interest; train it longer (--steps)")
         low, high = _corners(root)
         root["transform"] = stand.transform.T.ravel().tolist()  # column by column
         root["refine"] = "REPLACE"
@@ -161,7 +136,125 @@ def scene_of_run(
         write_json(out / SCENE_FILE, scene)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return Scene(writer.tiles, steps, writer.faces, root["geometricError"])
+    return Scene(writer.tiles, source.steps, writer.faces, root["geometricError"])
+
+
+def ply_of_run(
+    run: str | Path,
+    out: str | Path,
+    options: SceneOptions | None = None,
+    *,
+    say: Callable[[str], None] | None = None,
+    report: Report | None = None,
+) -> tuple[int, int]:
+    """Write the surface of a run as one PLY in input coordinates, cube by cube → the numbers of vertices and faces.
+
+    Cubes share the vertices on their sides. Memory is that of a cube, of those vertices, and of the support. Raises an
+    InputError, as `export_run` does.
+    """
+    options, out, say = options or SceneOptions(), Path(out), say or (lambda _: None)
+    placement = placement_of(options.up, options.unit, False)
+    if check_mesh_path(out).suffix.lower() != ".ply":
+        raise InputError(f"{out}: --in-parts writes .ply only")
+    source = _Source.of(run, options, say)
+    if "region" in source.record:
+        raise InputError(f"--in-parts: {source.file} is cut to a region, which takes the whole mesh; leave it out")
+    folder = partial_of(out).with_suffix(".parts")
+    try:
+        source.extract(folder, options, report=report)
+        paths = sorted(folder.iterdir())
+        sizes, faces, sides = list[int](), 0, [NOTHING]
+        for path in paths:
+            mesh, _, edges = _kept(path)
+            sizes.append(len(mesh.vertices))
+            sides.append(edges)
+            faces += len(mesh.faces)
+        # The first cube of those that share a vertex writes it.
+        _, first, number = np.unique(np.concatenate(sides), return_index=True, return_inverse=True)
+        again = np.ones(len(number), bool)
+        again[first] = False
+        rows, written, total = np.empty(len(first), np.int64), 0, sum(sizes) - int(again.sum())
+        show, starts = counted(report or silent, "writing the file"), np.cumsum([0, *map(len, sides[1:])])
+        with whole_file(out) as partial, partial.open("wb") as file:
+            for ending in (False, True):  # vertices, then faces
+                written = 0
+                for k, path in enumerate(paths):
+                    mesh, shared, _ = _kept(path)
+                    here = slice(*starts[k : k + 2])
+                    repeated, row = np.zeros(sizes[k], bool), np.empty(sizes[k], np.int64)
+                    repeated[shared[again[here]]] = True
+                    row[~repeated] = written + np.arange(sizes[k] - int(repeated.sum()))
+                    if ending:
+                        row[shared] = rows[number[here]]
+                        file.write(ply_faces(row[mesh.faces]).data)
+                        show(k + 1, len(paths))
+                    else:
+                        rows[number[here][~again[here]]] = row[shared[~again[here]]]
+                        colors = None if source.colors is None else evaluated(source.colors, mesh.vertices)
+                        mesh = dataclasses.replace(mesh, vertices=source.similarity.to_input(mesh.vertices))
+                        placed, double = mesh.placed(".ply", source.similarity, placement)
+                        columns = (None if each is None else each[~repeated] for each in (placed.normals, colors))
+                        lines, vertices = ply_vertices(placed.vertices[~repeated], *columns, double=double, total=total)
+                        if k == 0:
+                            file.write("\n".join([*lines, *ply_faces_header(faces)]).encode())
+                        file.write(vertices.data)
+                    written += int((~repeated).sum())
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return total, faces
+
+
+class _Source(NamedTuple):
+    """What is extracted: the field of a run, and a lattice.
+
+    Attributes:
+        resolution: cells along the longest side of the lattice, at the finest step of ``steps``.
+    """
+
+    file: Path
+    field: Field
+    similarity: Similarity
+    record: dict[str, Any]
+    level: int
+    support: Support | None
+    colors: Colors | None
+    bounds: Bounds
+    resolution: int
+    steps: int
+
+    @classmethod
+    def of(cls, run: str | Path, options: SceneOptions, say: Callable[[str], None]) -> _Source:
+        """Load a run."""
+        file = find_field(run)
+        field, similarity, metadata = load_still(file, options.time)
+        record = metadata.get("run", {})
+        level = chosen_level(field, file, options.level)
+        support = None if options.time is not None else read_support(file, record, level)
+        lattice = _lattice(support, chosen_resolution(field, options.resolution, support, level, say), options.cells)
+        colors = colors_of_run(file, field, options.time) if options.colors else None
+        return cls(file, field, similarity, record, level, support, colors, *lattice)
+
+    def extract(self, folder: Path, options: SceneOptions, *, step: int = 0, report: Report | None = None) -> None:
+        """Keep the cubes of a step of detail in a new ``folder``; of level 0 and more."""
+        folder.mkdir(parents=True)
+        size = self.resolution // 2**step
+        show = counted(report or silent, f"tiles of {size} cells per side")
+        # Coarse cells may miss all of a thin surface.
+        with surface_needed(f"{self.file}: no surface to mesh") if step == 0 else suppress(NoSurfaceError):
+            for part in extract_parts(
+                self.field,
+                resolution=size,
+                cells=options.cells,
+                level=max(0, self.level - step),
+                bounds=self.bounds,
+                progress=lambda _, done, total: show(done, total),
+            ):
+                if "region" not in self.record:
+                    _keep(folder, part.place, part.mesh, part.shared, part.edges)
+                elif (inside := within_sphere(part.mesh)) is not None:
+                    _keep(folder, part.place, inside, NOTHING, NOTHING)
+        if self.support is not None and not self.support.visible and not options.keep_unsupported:
+            _drop_unsupported(folder, self.support)
 
 
 def _stand(
@@ -244,7 +337,11 @@ def _drop_unsupported(folder: Path, support: Support) -> None:
             path.unlink()
         elif not kept.all():
             x, y, z = map(int, path.stem.split("_"))
-            _keep(folder, (x, y, z), keep_faces(_kept(path)[0], kept), NOTHING, NOTHING)
+            mesh, shared, lattice_edges = _kept(path)
+            used = np.unique(mesh.faces[kept])
+            stay = np.isin(shared, used)
+            shared, lattice_edges = np.searchsorted(used, shared[stay]), lattice_edges[stay]
+            _keep(folder, (x, y, z), keep_faces(mesh, kept), shared, lattice_edges)
 
 
 def _corners(entry: Mapping[str, Any]) -> tuple[Float64, Float64]:

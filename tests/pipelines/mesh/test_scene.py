@@ -7,7 +7,9 @@ import pytest
 import trimesh
 from mplicits.neural_fields import Box, InputError, Similarity, Sphere, Union, save_field
 from mplicits.pipelines.cli.entry import main
-from mplicits.pipelines.mesh.scene import SceneOptions, scene_of_run
+from mplicits.pipelines.mesh import scene
+from mplicits.pipelines.mesh.scene import SceneOptions, ply_of_run, scene_of_run
+from mplicits.pipelines.surface.surface import Support
 
 HOME = Similarity((512_345.0, 5_403_210.0, 312.5), 40.0)  # metres of UTM zone 32
 
@@ -78,17 +80,18 @@ def test_the_tree_holds_the_surface_coarse_to_fine(run, tmp_path):
     assert 0 < root["geometricError"] < 3 * coarse**2 / (8 * 32) + 3 * (coarse / 2) ** 2 / (8 * 32) + coarse / 100
 
 
-def test_parts_without_points_go_as_from_a_mesh(tmp_path, monkeypatch):
-    """A ball with points and a ball without, which reaches through several tiles."""
-    from mplicits.pipelines.mesh import scene
-    from mplicits.pipelines.surface.surface import Support
-
-    run = tmp_path / "field.safetensors"
-    save_field(run, Union(Sphere(center=(-0.5, 0, 0), radius=0.3), Sphere(center=(0.5, 0, 0), radius=0.3)))
+def two_balls():
+    """Points of a ball, and a stray, so that the box of the lattice holds another ball."""
     directions = np.random.default_rng(0).normal(size=(4000, 3))
     points = 0.3 * directions / np.linalg.norm(directions, axis=1, keepdims=True) - (0.5, 0, 0)
-    wide = np.concatenate((points, [(0.9, 0.4, 0.4)]))  # a stray, so that the box holds both
-    monkeypatch.setattr(scene, "read_support", lambda *_: Support(wide, 0.05))
+    return Support(np.concatenate((points, [(0.9, 0.4, 0.4)])), 0.05)
+
+
+def test_parts_without_points_go_as_from_a_mesh(tmp_path, monkeypatch):
+    """A ball with points and a ball without, which reaches through several tiles."""
+    run = tmp_path / "field.safetensors"
+    save_field(run, Union(Sphere(center=(-0.5, 0, 0), radius=0.3), Sphere(center=(0.5, 0, 0), radius=0.3)))
+    monkeypatch.setattr(scene, "read_support", lambda *_: two_balls())
     for keep, volume in ((False, 1), (True, 2)):
         out = tmp_path / f"scene{keep}"
         scene_of_run(run, out, SceneOptions(resolution=64, cells=16, keep_unsupported=keep))
@@ -179,3 +182,50 @@ def test_a_place_outside_of_the_system_is_refused(tmp_path):
     for crs, complaint in (("EPSG:25832", "outside"), ("EPSG:4326", "lengths")):
         with pytest.raises(InputError, match=complaint):
             scene_of_run(run, tmp_path / "scene", SceneOptions(resolution=24, crs=crs))
+
+
+def test_a_mesh_in_parts_is_one_closed_mesh_in_input_coordinates(run, tmp_path, capsys):
+    out = tmp_path / "ball.ply"
+    assert main(["mesh", str(run), "-o", str(out), "--in-parts", "--resolution", "64"]) == 0
+    assert "--in-parts" not in capsys.readouterr().err
+    options = SceneOptions(resolution=64, cells=16, up="y")  # a PLY is z-up
+    written = ply_of_run(run, tmp_path / "cubes.ply", options)
+    one, cubes = (trimesh.load(path, process=False) for path in (out, tmp_path / "cubes.ply"))
+    assert written == (len(cubes.vertices), len(cubes.faces)) == (len(one.vertices), len(one.faces))
+    assert one.is_watertight
+    assert cubes.is_watertight
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "cubes.ply", "field.safetensors"]
+    x, y, z = HOME.center
+    for mesh, center in ((one, (x, y, z)), (cubes, (x, -z, y))):
+        assert np.linalg.norm(mesh.vertices - center, axis=1) == pytest.approx(32, abs=2e-3)
+        assert mesh.volume == pytest.approx(4 / 3 * np.pi * 32**3, rel=2e-3)
+        outward = (mesh.vertices - center) / 32
+        rows = mesh.metadata["_ply_raw"]["vertex"]["data"]
+        normals = np.stack([rows[name] for name in ("nx", "ny", "nz")], axis=1)
+        assert np.allclose(normals, outward, atol=2.04 / 64 / 0.8 / 8)  # an eighth of a cell aside
+
+
+def test_a_mesh_in_parts_loses_whole_components(tmp_path, monkeypatch):
+    run, out = tmp_path / "field.safetensors", tmp_path / "mesh.ply"
+    save_field(run, Union(Sphere(center=(-0.5, 0, 0), radius=0.3), Sphere(center=(0.5, 0, 0), radius=0.3)))
+    monkeypatch.setattr(scene, "read_support", lambda *_: two_balls())
+    ply_of_run(run, out, SceneOptions(resolution=64, cells=16))
+    mesh = trimesh.load(out, process=False)
+    assert mesh.is_watertight
+    assert mesh.vertices[:, 0].max() < 0
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * 0.3**3, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("flags", "complaint"),
+    [
+        (["-o", "x.obj"], "writes .ply only"),
+        (["-o", "x.ply", "--faces", "100"], "--faces: does not go with --in-parts"),
+        (["-o", "x.ply", "--crs", "EPSG:4326"], "--crs: does not go with --in-parts"),
+        (["-o", "x.ply", "--format", "3dtiles"], "--format: does not go with --in-parts"),
+    ],
+)
+def test_what_does_not_go_with_parts_is_refused(run, tmp_path, capsys, monkeypatch, flags, complaint):
+    monkeypatch.chdir(tmp_path)
+    assert main(["mesh", str(run), "--in-parts", *flags]) == 2
+    assert complaint in capsys.readouterr().err
