@@ -50,7 +50,7 @@ class Rows:
     def __len__(self) -> int:
         return len(self.points)
 
-    def take(self, index: Tensor) -> Self:
+    def take(self, index: Tensor | slice) -> Self:
         """The rows at ``index``."""
         return self._each(lambda column: column[index])
 
@@ -250,32 +250,31 @@ def off_surface_samples(
     spread as for level 0, of the samples ``band`` a quarter as many, and ``count`` more around unseen ones.
     """
 
-    def found(samples: Samples) -> OffSurface:
-        points = samples.points.cpu().numpy()
-        assert samples.value is not None
+    def found(samples: Samples, *, lost_only: bool = False) -> OffSurface:
+        points, value = samples.points.cpu().numpy(), samples.value
+        assert value is not None
         distance, gap = cloud.nearest_gap(points)
-        away = np.flatnonzero(distance > options.clear * gap + CLOUD.chance * cloud.noise)
+        lost = distance - value.abs().cpu().numpy() > np.maximum(delta, options.clear * gap)
+        away = np.flatnonzero(lost if lost_only else distance > options.clear * gap + CLOUD.chance * cloud.noise)
         depth = cloud.winding_number(points[away]) - 0.5
         sure = np.abs(depth) > (options.sure_guessed if cloud.guessed else options.sure)
-        lost = distance - samples.value.abs().cpu().numpy() > np.maximum(delta, options.clear * gap)
         unseen = samples.take(torch.from_numpy(away[~sure & lost[away]]).to(device))
-        clear, away, depth = samples.take(torch.from_numpy(away[sure]).to(device)), away[sure], depth[sure]
-        length = np.minimum(distance[away], 2 * delta)
-        signed = torch.from_numpy(np.where(depth > 0, -length, length).astype(np.float32)).to(device)
-        return OffSurface(replace(clear, distance=signed), replace(unseen, distance=unseen.value))
+        rows = torch.from_numpy(away[sure]).to(device)
+        length = np.minimum(distance[away[sure]], 2 * delta)
+        signed = torch.from_numpy(np.where(depth[sure] > 0, -length, length).astype(np.float32)).to(device)
+        error = (value[rows] - signed).abs()
+        clear = replace(samples.take(rows), distance=signed, area=error + options.right * error.mean())
+        return OffSurface(clear, replace(unseen, distance=unseen.value))
 
     def placed(points: Tensor) -> Samples:
         return with_previous(Samples(points), field, delta, device=device)
 
     first = found(placed(spread_points(cloud, count, generator)).joined(band.take(slice(count // 4))))
-    if len(first.clear):
-        error = (first.clear.value - first.clear.distance).abs()
-        first = first._replace(clear=replace(first.clear, area=error + options.right * error.mean()))
     if len(first.unseen) < options.fewest:
         return first
     seeds = first.unseen.points.cpu()[torch.randint(len(first.unseen), (count,), generator=generator)]
     beside = seeds + (2 * torch.rand(count, 3, generator=generator) - 1) * 2 * delta
-    return first._replace(unseen=found(placed(beside.clamp(-DOMAIN, DOMAIN))).unseen)
+    return first._replace(unseen=found(placed(beside.clamp(-DOMAIN, DOMAIN)), lost_only=True).unseen)
 
 
 def spread_points(cloud: CloudDistance, count: int, generator: torch.Generator) -> Tensor:
