@@ -307,7 +307,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             on_trial = verdict.unsettled and level + 1 < self.config.num_levels and not self.on_trial
             silenced |= not (verdict.better or on_trial)
         if silenced:
-            self.silence(siren)
+            _silence(siren)
             self.errors = before
         self.stages.append(
             {
@@ -357,14 +357,9 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
         if not verdict.better:
             for later, siren in zip(self.stages[number:], levels[number:], strict=True):
                 later["silenced"] = True
-                self.silence(siren)
+                _silence(siren)
             self.errors = self.values_at_cloud()
             self.stages[-1].update(self.surface_errors())
-
-    def silence(self, siren: Any) -> None:
-        """Set a residual to zero."""
-        nn.init.zeros_(siren.output.weight)
-        nn.init.zeros_(siren.output.bias)
 
     def sources(
         self, index: CloudDistance, delta: float | None, config: FitConfig, generator: torch.Generator
@@ -526,6 +521,12 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             **self.common_record(finished=finished),
             **self.stages_record(),
         }
+
+
+def _silence(siren: Any) -> None:
+    """Set a residual to zero."""
+    nn.init.zeros_(siren.output.weight)
+    nn.init.zeros_(siren.output.bias)
 
 
 def _rms(errors: Tensor) -> float:

@@ -173,7 +173,7 @@ def ply_of_run(
         _, first, number = np.unique(np.concatenate(sides), return_index=True, return_inverse=True)
         again = np.ones(len(number), bool)
         again[first] = False
-        rows, written, total = np.empty(len(first), np.int64), 0, sum(sizes) - int(again.sum())
+        rows, total = np.empty(len(first), np.int64), sum(sizes) - int(again.sum())
         show, starts = counted(report or silent, "writing the file"), np.cumsum([0, *map(len, sides[1:])])
         with whole_file(out) as partial, partial.open("wb") as file:
             for ending in (False, True):  # vertices, then faces
