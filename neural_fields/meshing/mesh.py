@@ -260,17 +260,9 @@ def weld(vertices: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.i
 
 
 def ply_vertices(
-    points: NDArray[Any],
-    normals: NDArray[Any] | None,
-    colors: NDArray[Any] | None,
-    *,
-    double: bool,
-    total: int | None = None,
-) -> tuple[list[str], NDArray[Any]]:
-    """The first lines of the header of a binary PLY, and its rows of points, and of normals and colours ``(N, 3)``.
-
-    ``total`` is the number of rows of the file, if these are not all.
-    """
+    points: NDArray[Any], normals: NDArray[Any] | None, colors: NDArray[Any] | None, *, double: bool
+) -> NDArray[Any]:
+    """The rows of a PLY of points, and of normals and colours, ``(N, 3)``."""
     kind = "<f8" if double else "<f4"
     columns: list[tuple[str, str, NDArray[Any]]] = [(name, kind, c) for name, c in zip("xyz", points.T, strict=True)]
     if normals is not None:
@@ -281,28 +273,7 @@ def ply_vertices(
     rows = np.empty(len(points), [(name, kind) for name, kind, _ in columns])
     for name, _, column in columns:
         rows[name] = column
-    names = {"<f8": "double", "<f4": "float", "u1": "uchar"}
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment mplicits",
-        f"element vertex {len(rows) if total is None else total}",
-    ]
-    return header + [f"property {names[kind]} {name}" for name, kind, _ in columns], rows
-
-
-def _write_ply(path: Path, mesh: Mesh, home: Similarity, placement: Placement) -> None:
-    mesh, double = mesh.placed(".ply", home, placement)
-    header, vertices = ply_vertices(mesh.vertices, mesh.normals, mesh.colors, double=double)
-    with path.open("wb") as file:
-        file.write("\n".join([*header, *ply_faces_header(len(mesh.faces))]).encode())
-        file.write(vertices.data)
-        file.write(ply_faces(mesh.faces).data)
-
-
-def ply_faces_header(total: int) -> list[str]:
-    """The last lines of the header of a PLY of triangles."""
-    return [f"element face {total}", "property list uchar int vertex_indices", "end_header\n"]
+    return rows
 
 
 def ply_faces(faces: NDArray[np.integer]) -> NDArray[Any]:
@@ -310,6 +281,25 @@ def ply_faces(faces: NDArray[np.integer]) -> NDArray[Any]:
     rows = np.empty(len(faces), [("count", "u1"), ("index", "<i4", 3)])
     rows["count"], rows["index"] = 3, faces
     return rows
+
+
+def ply_header(row: np.dtype[Any], vertices: int, faces: int | None = None) -> bytes:
+    """The header of a binary PLY of so many rows of `ply_vertices`, each a ``row``, and of `ply_faces`, if any."""
+    kinds = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
+    lines = ["ply", "format binary_little_endian 1.0", "comment mplicits", f"element vertex {vertices}"]
+    lines += [f"property {kinds[row[name].str]} {name}" for name in row.names or ()]
+    if faces is not None:
+        lines += [f"element face {faces}", "property list uchar int vertex_indices"]
+    return "\n".join([*lines, "end_header\n"]).encode()
+
+
+def _write_ply(path: Path, mesh: Mesh, home: Similarity, placement: Placement) -> None:
+    mesh, double = mesh.placed(".ply", home, placement)
+    vertices = ply_vertices(mesh.vertices, mesh.normals, mesh.colors, double=double)
+    with path.open("wb") as file:
+        file.write(ply_header(vertices.dtype, len(vertices), len(mesh.faces)))
+        file.write(vertices.data)
+        file.write(ply_faces(mesh.faces).data)
 
 
 def _write_stl(path: Path, mesh: Mesh, home: Similarity, placement: Placement) -> None:

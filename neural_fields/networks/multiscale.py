@@ -127,6 +127,10 @@ class MultiscaleSDF(Field):
         deltas = [*self.deltas.tolist(), float(delta)]
         return MultiscaleSDF(self.base, [*self.levels[1:], residual], deltas, taper=self.taper)
 
+    def first_levels(self, count: int) -> MultiscaleSDF:
+        """This field with only its ``count`` coarsest levels, which are shared, not copied."""
+        return MultiscaleSDF(self.base, self.levels[1:count], self.deltas[: count - 1], taper=self.taper)
+
     @property
     def levels(self) -> tuple[Field, ...]:
         """The base, and the residuals after it, coarse to fine."""

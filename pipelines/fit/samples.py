@@ -225,7 +225,7 @@ def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Gener
 class OffSurface(NamedTuple):
     """Samples of a band far from every point of the cloud, see `off_surface_samples`; field names are source names."""
 
-    clear: Samples  # surely inside or outside
+    clear: Samples  # of clear sign
     unseen: Samples  # of uncertain sign
 
 

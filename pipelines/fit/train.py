@@ -304,7 +304,7 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             seen = ~self.held
             learnt = _rms(self.errors[seen]) / max(_rms(before[seen]), 1e-30)
             verdict = verdict._replace(learnt=learnt)
-            on_trial = verdict.unsettled and level + 1 < self.config.num_levels and not self.on_trial
+            on_trial = verdict.unsettled and level + 1 < self.config.num_levels and self.trial is None
             silenced |= not (verdict.better or on_trial)
         if silenced:
             _silence(siren)
@@ -338,18 +338,17 @@ class _Fitting(Training[FitConfig, MultiscaleSDF]):
             self.level_done(self.frozen, self.similarity)
 
     @property
-    def on_trial(self) -> dict[str, Any] | None:
+    def trial(self) -> dict[str, Any] | None:
         """The stage of the level that waits for the next one to decide whether both are kept."""
         return next((stage for stage in self.stages if stage.get("on_trial")), None)
 
     def settle(self) -> None:
         """Keep the level on trial if it is better than none with the levels after it, else set them to zero."""
-        stage = self.on_trial
+        stage = self.trial
         if stage is None or self.frozen is None:
             return
         number, levels = stage["level"], self.frozen.levels
-        before = MultiscaleSDF(levels[0], levels[1:number], self.frozen.deltas[: number - 1]).to(self.device)
-        judge = self.judge(stage["delta"], before)
+        judge = self.judge(stage["delta"], self.frozen.first_levels(number))
         assert judge is not None  # there was one when the trial began
         verdict = judge.verdict(judge.errors_of(self.frozen), 1.0)._replace(until=self.frozen.num_levels - 1)
         stage.update(on_trial=False, silenced=not verdict.better)

@@ -24,7 +24,7 @@ from ...neural_fields.backend.files import check_place, partial_of, remove, rena
 from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing._cells import CORNERS, Bounds
 from ...neural_fields.meshing.extract import DEFAULT_BOUNDS, NoSurfaceError, surface_needed
-from ...neural_fields.meshing.mesh import check_mesh_path, ply_faces, ply_faces_header, ply_vertices
+from ...neural_fields.meshing.mesh import check_mesh_path, ply_faces, ply_header, ply_vertices
 from ...neural_fields.meshing.parts import Place, extract_parts
 from ..surface.surface import (
     Footing,
@@ -163,42 +163,42 @@ def ply_of_run(
     try:
         source.extract(folder, options, report=report)
         paths = sorted(folder.iterdir())
-        sizes, faces, sides = list[int](), 0, [NOTHING]
+        total, faces, sides = 0, 0, [NOTHING]
         for path in paths:
             mesh, _, edges = _kept(path)
-            sizes.append(len(mesh.vertices))
+            total, faces = total + len(mesh.vertices), faces + len(mesh.faces)
             sides.append(edges)
-            faces += len(mesh.faces)
         # The first cube of those that share a vertex writes it.
         _, first, number = np.unique(np.concatenate(sides), return_index=True, return_inverse=True)
         again = np.ones(len(number), bool)
         again[first] = False
-        rows, total = np.empty(len(first), np.int64), sum(sizes) - int(again.sum())
-        show, starts = counted(report or silent, "writing the file"), np.cumsum([0, *map(len, sides[1:])])
+        total -= int(again.sum())
+        known, starts = np.empty(len(first), np.int64), np.cumsum([0, *map(len, sides[1:])])
+        show = counted(report or silent, "writing the file")
         with whole_file(out) as partial, partial.open("wb") as file:
-            for ending in (False, True):  # vertices, then faces
-                written = 0
-                for k, path in enumerate(paths):
-                    mesh, shared, _ = _kept(path)
-                    here = slice(*starts[k : k + 2])
-                    repeated, row = np.zeros(sizes[k], bool), np.empty(sizes[k], np.int64)
-                    repeated[shared[again[here]]] = True
-                    row[~repeated] = written + np.arange(sizes[k] - int(repeated.sum()))
-                    if ending:
-                        row[shared] = rows[number[here]]
-                        file.write(ply_faces(row[mesh.faces]).data)
-                        show(k + 1, len(paths))
-                    else:
-                        rows[number[here][~again[here]]] = row[shared[~again[here]]]
-                        colors = None if source.colors is None else evaluated(source.colors, mesh.vertices)
-                        mesh = dataclasses.replace(mesh, vertices=source.similarity.to_input(mesh.vertices))
-                        placed, double = mesh.placed(".ply", source.similarity, placement)
-                        columns = (None if each is None else each[~repeated] for each in (placed.normals, colors))
-                        lines, vertices = ply_vertices(placed.vertices[~repeated], *columns, double=double, total=total)
-                        if k == 0:
-                            file.write("\n".join([*lines, *ply_faces_header(faces)]).encode())
-                        file.write(vertices.data)
-                    written += int((~repeated).sum())
+            written = vertices_at = faces_at = 0
+            for k, path in enumerate(paths):
+                mesh, shared, _ = _kept(path)
+                own, ahead = number[starts[k] : starts[k + 1]], again[starts[k] : starts[k + 1]]
+                new = np.ones(len(mesh.vertices), bool)
+                new[shared[ahead]] = False
+                row = written + np.cumsum(new) - 1
+                known[own[~ahead]] = row[shared[~ahead]]
+                row[shared] = known[own]
+                colors = None if source.colors is None else evaluated(source.colors, mesh.vertices[new])
+                mesh = dataclasses.replace(mesh, vertices=source.similarity.to_input(mesh.vertices))
+                placed, double = mesh.placed(".ply", source.similarity, placement)
+                assert placed.normals is not None
+                vertices = ply_vertices(placed.vertices[new], placed.normals[new], colors, double=double)
+                if k == 0:
+                    vertices_at = file.write(ply_header(vertices.dtype, total, faces))
+                    faces_at = vertices_at + total * vertices.itemsize
+                file.seek(vertices_at + written * vertices.itemsize)
+                file.write(vertices.data)
+                file.seek(faces_at)
+                faces_at += file.write(ply_faces(row[mesh.faces]).data)
+                written += len(vertices)
+                show(k + 1, len(paths))
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return total, faces
@@ -235,7 +235,7 @@ class _Source(NamedTuple):
         return cls(file, field, similarity, record, level, support, colors, *lattice)
 
     def extract(self, folder: Path, options: SceneOptions, *, step: int = 0, report: Report | None = None) -> None:
-        """Keep the cubes of a step of detail in a new ``folder``; of level 0 and more."""
+        """Keep the cubes of a step in a new ``folder``; each step after the first has the level before, down to 0."""
         folder.mkdir(parents=True)
         size = self.resolution // 2**step
         show = counted(report or silent, f"tiles of {size} cells per side")

@@ -106,8 +106,7 @@ def _side_by_side(
         os.environ.setdefault(name, value)
     import ray  # after its environment is set
 
-    threads, held = max(1, torch.get_num_threads() // jobs), torch.cuda.device_count()
-    gpus = held // jobs if held >= jobs else 1 / math.ceil(jobs / held) if held else 0  # or the part of one, for each
+    threads, gpus = max(1, torch.get_num_threads() // jobs), _gpus_each(torch.cuda.device_count(), jobs)
 
     def work(item: Item) -> Outcome[Item, Result]:
         torch.set_num_threads(threads)
@@ -152,3 +151,10 @@ def _collected(ray: Any, done: Any, item: Item) -> Outcome[Item, Any]:
         lines = str(error).splitlines() or [""]
         reason = lines[-1] if isinstance(error, ray.exceptions.RayTaskError) else lines[0]  # the end of a traceback
         return Outcome(item, None, f"{type(error).__name__}: {reason}", math.nan)
+
+
+def _gpus_each(gpus: int, jobs: int) -> float:
+    """GPUs, or the part of one, for each job."""
+    if gpus >= jobs:
+        return gpus // jobs
+    return 1 / math.ceil(jobs / gpus) if gpus else 0

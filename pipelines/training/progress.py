@@ -92,7 +92,9 @@ class Lines:
         """Print what is worth a line."""
         ended, now = progress.fraction >= 1, self.clock()
         begun, before = self.begun.setdefault(progress.stage, (now, progress.fraction))
-        if (self.counting or progress.stage == self.finished) if ended else now - self.told < 30:
+        if ended and (self.counting or progress.stage == self.finished):
+            return
+        if not ended and now - self.told < 30:
             return
         if ended:
             steps = f"{progress.step:,} steps" if progress.losses else "done"

@@ -253,7 +253,7 @@ def _coarse(field: Field, levels: int) -> Field:
         return SpaceTimeSDF(sdf) if isinstance(sdf, MultiscaleSDF) else field
     if not isinstance(field, MultiscaleSDF) or levels == field.num_levels:
         return field
-    return MultiscaleSDF(field.base, list(field.levels[1:levels]), field.deltas[: levels - 1], taper=field.taper)
+    return field.first_levels(levels)
 
 
 def _outlines(stills: list[Field]) -> list[tuple[Field, NDArray[np.floating]]]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ....neural_fields import InputError
 from ....neural_fields.backend.files import write_whole
-from ....neural_fields.meshing.mesh import ply_vertices
+from ....neural_fields.meshing.mesh import ply_header, ply_vertices
 from ..point_cloud import PointCloud
 from .columns import Table, TableStream, choose_layout, cloud_from
 from .meshes import as_mesh, strips, triangulate
@@ -140,8 +140,8 @@ def ply_stream(path: Path, columns: str | None = None) -> TableStream | None:
 
 def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
     """Write ``cloud`` as binary little-endian PLY with double coordinates; an existing file is replaced at the end."""
-    header, rows = ply_vertices(cloud.points, cloud.normals, cloud.colors, double=True)
-    write_whole(path, "\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
+    rows = ply_vertices(cloud.points, cloud.normals, cloud.colors, double=True)
+    write_whole(path, ply_header(rows.dtype, len(rows)) + rows.tobytes())
 
 
 def _parse_header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
