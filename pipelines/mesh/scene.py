@@ -159,13 +159,14 @@ def ply_of_run(
     source = _Source.of(run, options, say)
     if "region" in source.record:
         raise InputError(f"--in-parts: {source.file} is cut to a region, which takes the whole mesh; leave it out")
+    if (line := placement.describe(".ply")) is not None:
+        say(f"coordinates: {line}")
     folder = partial_of(out).with_suffix(".parts")
     try:
         source.extract(folder, options, report=report)
         paths = sorted(folder.iterdir())
         total, faces, sides = 0, 0, [NOTHING]
-        for path in paths:
-            mesh, _, edges = _kept(path)
+        for mesh, _, edges in map(_kept, paths):
             total, faces = total + len(mesh.vertices), faces + len(mesh.faces)
             sides.append(edges)
         # The first cube of those that share a vertex writes it.

@@ -251,9 +251,7 @@ def _coarse(field: Field, levels: int) -> Field:
     if isinstance(field, SpaceTimeSDF):
         sdf = _coarse(field.sdf, levels)
         return SpaceTimeSDF(sdf) if isinstance(sdf, MultiscaleSDF) else field
-    if not isinstance(field, MultiscaleSDF) or levels == field.num_levels:
-        return field
-    return field.first_levels(levels)
+    return field.first_levels(levels) if isinstance(field, MultiscaleSDF) and levels < field.num_levels else field
 
 
 def _outlines(stills: list[Field]) -> list[tuple[Field, NDArray[np.floating]]]:

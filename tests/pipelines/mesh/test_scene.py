@@ -189,7 +189,9 @@ def test_a_mesh_in_parts_is_one_closed_mesh_in_input_coordinates(run, tmp_path, 
     assert main(["mesh", str(run), "-o", str(out), "--in-parts", "--resolution", "64"]) == 0
     assert "--in-parts" not in capsys.readouterr().err
     options = SceneOptions(resolution=64, cells=16, up="y")  # a PLY is z-up
-    written = ply_of_run(run, tmp_path / "cubes.ply", options)
+    lines = []
+    written = ply_of_run(run, tmp_path / "cubes.ply", options, say=lines.append)
+    assert lines == ["coordinates: z up"]
     one, cubes = (trimesh.load(path, process=False) for path in (out, tmp_path / "cubes.ply"))
     assert written == (len(cubes.vertices), len(cubes.faces)) == (len(one.vertices), len(one.faces))
     assert one.is_watertight
