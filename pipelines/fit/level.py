@@ -200,8 +200,8 @@ class Verdict(NamedTuple):
 
     @property
     def unsettled(self) -> bool:
-        """Whether one error is significantly less and the other more, so that the next level decides, see `better`."""
-        return max(self.fall) > JUDGE.surely and not (self.better or self.noisy)
+        """Whether it is neither better nor significantly worse in both errors, so that the next level decides."""
+        return max(self.fall) > -JUDGE.surely and not (self.better or self.noisy)
 
     @property
     def learns(self) -> bool:
