@@ -11,7 +11,7 @@ from ...neural_fields.fields.losses import eikonal_loss
 from ...neural_fields.spacetime.evolution import key_loss, law_loss
 from ...neural_fields.spacetime.field import spacetime_jet
 from ..training.settings import EvolveConfig
-from ..training.trainer import ErrorWeightedSampler, Group, Objective, Report, Trainer, seeded, warm_cosine
+from ..training.trainer import ErrorWeightedSampler, Objective, Report, Trainer, seeded, siren_groups
 from .problem import Problem
 from .samples import Known, band_points, indices_in_band, uniform_spacetime
 
@@ -34,9 +34,8 @@ class EvolveObjective(Objective):
         self, field: SpaceTimeSDF, problem: Problem, config: EvolveConfig, *, level: int, generator: torch.Generator
     ) -> None:
         device = field.like.device
-        trained = [parameter for parameter in field.parameters() if parameter.requires_grad]
-        rate = warm_cosine(config.learning_rates[level])
-        super().__init__(field, [Group(trained, rate)], generator, {"pool": torch.empty(0, 4, device=device)})
+        groups = siren_groups(field, config.learning_rates[level], config.turn)
+        super().__init__(field, groups, generator, {"pool": torch.empty(0, 4, device=device)})
         self.field, self.config, self.level, self.law = field, config, level, problem.law
         self.keys = problem.keys
         self.known, self.bounds = problem.known.to(device), problem.bounds.to(device)
@@ -109,7 +108,7 @@ class _StillObjective(Objective):
     """The shape at time 0, in space alone."""
 
     def __init__(self, siren: Siren, known: Known, config: EvolveConfig, generator: torch.Generator) -> None:
-        super().__init__(siren, [Group(list(siren.parameters()), warm_cosine(config.learning_rates[0]))], generator)
+        super().__init__(siren, siren_groups(siren, config.learning_rates[0], config.turn), generator)
         self.siren, self.config = siren, config
         self.known = known.take((known.points[:, 3] == 0).nonzero()[:, 0])
 

@@ -18,7 +18,7 @@ from ...neural_fields import Field, Siren
 from ...neural_fields.backend.devices import upload
 from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
 from ..training.settings import EvolveConfig, FitConfig
-from ..training.trainer import Group, Objective, seeded, warm_cosine, without_prefix
+from ..training.trainer import Objective, seeded, siren_groups, without_prefix
 from .cloud import drawn
 from .samples import LEAST, SQUARES, RobustScales, Samples, Source, at_feet, value_and_gradient, with_previous
 
@@ -66,20 +66,6 @@ def calm_omega(config: FitConfig, level: int, noise: float, options: LevelOption
     """
     omega = config.omegas[level]
     return min(omega, max(config.omegas[0], options.calm / noise)) if noise else omega
-
-
-def siren_groups(siren: Siren, rate: float, turn: float) -> list[Group]:
-    """Parameters of a SIREN for a `Trainer`: hidden matrices by Muon at the peak rate ``turn`` / ω, others by Adam.
-
-    In a step, the norm of the change of a hidden layer's phases is then at most about ``turn`` times that of its input.
-    Frequency and width do not matter; where all inputs are 1, that is ``turn`` radians. ``rate`` is Adam's peak rate.
-    Without ``turn``, all are trained by Adam.
-    """
-    names = {f"layers.{layer}.weight" for layer in range(1, siren.depth)} if turn else set()
-    hidden = [parameter for name, parameter in siren.named_parameters() if name in names]
-    others = [parameter for name, parameter in siren.named_parameters() if name not in names]
-    groups = [Group(others, warm_cosine(rate))]
-    return [*groups, Group(hidden, warm_cosine(turn / siren.omega), matrices=True)] if hidden else groups
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ...neural_fields.networks.grids import ValueGrid, split_tables
 from ...neural_fields.volume.render import Rendered, Sampling
 from ..training.cuda_graphs import CudaGraphRecorder, GraphCache, Recorder
 from ..training.settings import ReconstructConfig
-from ..training.trainer import ErrorWeightedSampler, Group, Objective, Trainer, warm_cosine
+from ..training.trainer import ErrorWeightedSampler, Group, Objective, Trainer, siren_groups, warm_cosine
 from .consistency import Cameras, ConsistencyOptions, GreyPictures, Pixels, consistency_loss, surface_near
 from .measured import MeasuredDepths, depth_loss
 from .model import RayPool, Rays, SceneModel
@@ -81,7 +81,7 @@ class SceneObjective(Objective):
         parts = [part for part in (model.color, model.outside, model.exposures) if part is not None]
         grid, colors = split_tables(*parts)
         groups = [
-            Group(list(model.geometry.parameters()), rate),
+            *siren_groups(model.geometry, config.learning_rate, config.turn),
             Group(colors, lambda done: config.color_rate * rate(done)),
             Group([model.variance], lambda done: config.sharpening * rate(done)),
         ]
@@ -341,10 +341,11 @@ class GraphTrainer(Trainer[SceneObjective]):
     def _work(self, kind: Kind, capacities: Capacities) -> dict[str, Tensor]:
         """The device's part of a step."""
         objective = self.objective
+        groups = [group for optimiser in self.optimisers.values() for group in optimiser.param_groups]
         rates = graph_input(
-            lambda: torch.tensor([group.rate(objective.done) for group in objective.groups]), self.trained[0].device
+            lambda: torch.tensor([group["rate"](objective.done) for group in groups]), self.trained[0].device
         )
-        for group, rate in zip(self.adam.param_groups, rates.unbind(), strict=True):
+        for group, rate in zip(groups, rates.unbind(), strict=True):
             group["lr"] = rate
         given = capacities or ()
         with fixed_shapes(given[len(CHOICES) :], named_capacity=dict(zip(CHOICES, given, strict=False))) as shapes:
@@ -355,7 +356,8 @@ class GraphTrainer(Trainer[SceneObjective]):
             overflow = torch.stack(over).any().float() if over else requested.new_zeros(())
             self.peaks[: len(requested)] = torch.maximum(self.peaks[: len(requested)], requested)
             self.peaks[-1] += overflow
-        self.adam.found_inf = overflow  # pyright: ignore[reportAttributeAccessIssue]  of a step that is not taken it is 1
+        for optimiser in self.optimisers.values():  # of a step that is not taken it is 1
+            optimiser.found_inf = overflow  # pyright: ignore[reportAttributeAccessIssue]
         self.descend(outcome.total)
         return {name: term.detach() for name, term in outcome.terms.items()} | {"samples": outcome.samples}
 

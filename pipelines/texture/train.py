@@ -45,7 +45,7 @@ from ..training.progress import Report, reported, silent
 from ..training.result import Run
 from ..training.scaffold import BUDGET, Budget, Training, affordable, step_seconds
 from ..training.settings import TextureConfig, load_config
-from ..training.trainer import Group, Objective, Trainer, parameter_count, seeded, stop_on_signals, warm_cosine
+from ..training.trainer import Objective, Trainer, parameter_count, seeded, siren_groups, stop_on_signals
 
 
 class ColorSamples(NamedTuple):
@@ -401,7 +401,7 @@ class TextureObjective(Objective):
         delta: float,
         generator: torch.Generator,
     ) -> None:
-        super().__init__(network, [Group(list(network.parameters()), warm_cosine(config.learning_rate))], generator)
+        super().__init__(network, siren_groups(network, config.learning_rate, config.turn), generator)
         self.colors, self.samples, self.band, self.config, self.delta = network, samples, band, config, delta
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:

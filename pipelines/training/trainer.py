@@ -17,6 +17,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
+from ...neural_fields import Siren
 from ...neural_fields.backend.devices import graph_input, precise
 from .progress import Progress, Report, silent
 
@@ -110,15 +111,34 @@ class Group(NamedTuple):
     matrices: bool = False
 
 
+def siren_groups(network: nn.Module, rate: float, turn: float) -> list[Group]:
+    """What is trained of a network: hidden matrices of its SIRENs by `Muon`, at most at ``turn`` / ω, the rest by Adam.
+
+    In a step, the norm of the change of a hidden layer's phases is then at most about ``turn`` times that of its input.
+    Frequency and width do not matter; where all inputs are 1, that is ``turn`` radians. ``rate`` is Adam's peak rate.
+    Without ``turn``, all are trained by Adam.
+    """
+    groups = []
+    for siren in (part for part in network.modules() if turn and isinstance(part, Siren)):
+        hidden = [matrix for matrix in siren.layers[1:].parameters() if matrix.requires_grad and matrix.ndim == 2]
+        if hidden:
+            groups.append(Group(hidden, warm_cosine(turn / siren.omega), matrices=True))
+    taken = {id(matrix) for group in groups for matrix in group.parameters}
+    others = [each for each in network.parameters() if each.requires_grad and id(each) not in taken]
+    return [Group(others, warm_cosine(rate)), *groups]
+
+
 class Muon(torch.optim.Optimizer):
     """Descent along matrices that are made orthogonal: ``W ← W − lr · U Vᵀ`` for a gradient ``U S Vᵀ`` with momentum.
 
     All directions of a matrix are learnt at one speed, so a SIREN needs half of Adam's steps (Jordan et al., "Muon",
     2024). `torch.optim.Muon` multiplies in bfloat16, which takes longer than the step itself on CPUs without it.
-    The momentum is Nesterov's: one step of it is looked ahead. ``matrices`` are groups of them, ``(n, m)`` each.
+    The momentum is Nesterov's: one step of it is looked ahead. ``matrices`` are groups of equal shapes ``(n, m)``. As
+    of Adam, a step changes nothing where ``found_inf`` is 1.
     """
 
     momentum = 0.9
+    found_inf: Tensor | float = 0.0
 
     def __init__(self, matrices: list[dict[str, Any]]) -> None:
         super().__init__(matrices, {"lr": 0.0})
@@ -126,23 +146,28 @@ class Muon(torch.optim.Optimizer):
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """One step with the rate ``lr`` of each group: the largest change of a layer over the norm of its input."""
+        taken = 1 - self.found_inf
         for group in self.param_groups:
-            for matrix in group["params"]:
+            matrices, ahead = [matrix for matrix in group["params"] if matrix.grad is not None], []
+            for matrix in matrices:
                 mean = self.state[matrix].setdefault("momentum", torch.zeros_like(matrix))
-                mean.lerp_(matrix.grad, 1 - self.momentum)
-                matrix.sub_(orthogonal(matrix.grad.lerp(mean, self.momentum)), alpha=group["lr"])
+                mean.lerp_(matrix.grad, taken * (1 - self.momentum))
+                ahead.append(matrix.grad.lerp(mean, self.momentum))
+            for matrix, way in zip(matrices, orthogonal(torch.stack(ahead)) if ahead else (), strict=True):
+                matrix.sub_(taken * group["lr"] * way)
 
 
-def orthogonal(matrix: Tensor) -> Tensor:
-    """About ``U Vᵀ`` of a matrix ``U S Vᵀ`` ``(n, m)``: odd polynomials take its singular values to 0.7 to 1.2.
+def orthogonal(matrices: Tensor) -> Tensor:
+    """About ``U Vᵀ`` of matrices ``U S Vᵀ`` ``(k, n, m)``: odd polynomials take singular values to 0.7 to 1.2.
 
     The coefficients are those of Jordan et al. (2024), for the steepest slope at 0.
     """
     first, third, fifth = 3.4445, -4.7750, 2.0315
-    found = matrix / matrix.norm().clamp_min(torch.finfo(matrix.dtype).tiny)
+    found = matrices / matrices.norm(dim=(1, 2), keepdim=True).clamp_min(torch.finfo(matrices.dtype).tiny)
     for _ in range(5):
-        square = found @ found.T
-        found = torch.addmm(found, torch.addmm(square, square, square, beta=third, alpha=fifth), found, beta=first)
+        square = found @ found.mT
+        mixed = torch.baddbmm(square, square, square, beta=third, alpha=fifth)
+        found = torch.baddbmm(found, mixed, found, beta=first)
     return found
 
 

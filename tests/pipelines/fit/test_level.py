@@ -22,7 +22,6 @@ from mplicits.pipelines.fit.level import (
     Verdict,
     held_out,
     noisy_points,
-    siren_groups,
     standard_errors,
 )
 from mplicits.pipelines.fit.samples import RobustScales, Samples, Source, at_feet, with_previous
@@ -104,31 +103,6 @@ def test_large_errors_count_as_the_level_counts_them() -> None:
     judge = Judge(x, -x / RADIUS, Sphere(radius=RADIUS - OFF), 0.1, spacing=SPACING, **terms)
     turned, away = 1e-3 * ((1 + 4 / 1e-3) ** 0.5 - 1), 1e-5 * ((1 + 2 * OFF**2 / 1e-5) ** 0.5 - 1)  # 1 − cos = 2
     assert judge.before.loss == pytest.approx(3 * turned + 100 * away, rel=1e-4)
-
-
-def test_a_step_changes_phases_by_the_turn_whatever_the_frequency_and_width() -> None:
-    torch.manual_seed(0)
-    for width, omega in ((16, 5.0), (64, 80.0)):
-        siren = Siren(width, 3, omega=omega)
-        others, hidden = siren_groups(siren, 1e-3, 0.4)
-        grouped = [id(parameter) for group in (others, hidden) for parameter in group.parameters]
-        assert sorted(grouped) == sorted(id(parameter) for parameter in siren.parameters())
-        assert [parameter.shape for parameter in hidden.parameters] == [(width, width)] * 2
-        assert (others.matrices, hidden.matrices) == (False, True)
-        assert max(map(others.rate, np.linspace(0, 1, 101))) == pytest.approx(1e-3, rel=1e-2)
-        before = [matrix.detach().clone() for matrix in hidden.parameters]
-        samples = Samples(points(256), torch.zeros(256))
-        source = Source("surface", samples, 256, 1.0, 0.0, 1.0)
-        learner = LevelObjective(
-            siren, [source], learning_rate=1e-3, generator=torch.Generator().manual_seed(0), turn=0.4
-        )
-        learner.groups = [others._replace(rate=lambda _: 0.0), hidden._replace(rate=lambda _, peak=0.4 / omega: peak)]
-        Trainer(learner, stage="level 0", steps=1).run()
-        for old, new in zip(before, hidden.parameters, strict=True):
-            change = omega * torch.linalg.svdvals((new - old).detach()).max()  # of phases, over the norm of the input
-            assert 0.25 < float(change) < 1.21 * 0.4
-    assert [group.matrices for group in siren_groups(Siren(8, 2), 1e-3, 0.0)] == [False]
-    assert [group.matrices for group in siren_groups(Siren(8, 1), 1e-3, 0.4)] == [False]  # no hidden matrix
 
 
 def objective(judge: Judge, target: float, turn: float = 0.0) -> LevelObjective:

@@ -139,7 +139,7 @@ def test_a_step_that_exceeds_its_capacity_is_not_taken_and_the_capacity_grows(im
     trainer.capacities = {kind: (1, 1, 1, 1)}
     trainer.requested = {}  # so that they are not found too small
     before = weights(trainer)
-    moments = {name: tensor.clone() for name, tensor in trainer.state().items() if name.startswith("adam.")}
+    moments = {name: tensor.clone() for name, tensor in trainer.state().items() if name.startswith(("adam.", "muon."))}
     trainer.objective.before_step = lambda step, done: kind  # pyright: ignore[reportAttributeAccessIssue]
     trainer._step()
     for name, tensor in weights(trainer).items():

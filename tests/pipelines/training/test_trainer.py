@@ -2,8 +2,10 @@
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
+from mplicits.neural_fields import MultiscaleSDF, Siren
 from mplicits.pipelines.training.trainer import (
     ErrorWeightedSampler,
     Group,
@@ -13,6 +15,7 @@ from mplicits.pipelines.training.trainer import (
     StopFlag,
     Trainer,
     orthogonal,
+    siren_groups,
     warm_cosine,
 )
 from torch import Tensor, nn
@@ -122,11 +125,14 @@ def test_singular_values_become_nearly_one_and_directions_stay(shape: tuple[int,
     left, _, right = torch.linalg.svd(torch.randn(*shape, dtype=torch.float64), full_matrices=False)
     # Of a matrix of norm below 2, the least is 0.01 of the norm: its part grows 3.4-fold in each step, up to about 1.
     values = torch.linspace(0.02, 0.6, min(shape), dtype=torch.float64)
-    found = left.T @ orthogonal(left * values @ right) @ right.T
+    # Of two at a time, each is made orthogonal by itself.
+    found, other = orthogonal(torch.stack((left * values @ right, 1e-3 * left * values.flip(0) @ right)))
+    found, other = (left.T @ each @ right.T for each in (found, other))
+    assert torch.allclose(other, found.flip(0, 1))
     assert float(found.diag().min()) > 0.67
     assert float(found.diag().max()) < 1.21
     assert (found - found.diag().diag()).abs().max() < 1e-12
-    assert orthogonal(torch.zeros(*shape)).eq(0).all()
+    assert orthogonal(torch.zeros(1, *shape)).eq(0).all()
 
 
 def test_a_step_of_matrices_is_as_long_as_the_rate_in_all_directions() -> None:
@@ -145,6 +151,67 @@ def test_a_step_of_matrices_is_as_long_as_the_rate_in_all_directions() -> None:
         errors.append(float(loss.detach()))
     # The step of a constant rate ends where it is as long as the way: within 0.121 in each of twelve directions.
     assert errors[-1] < 12 * 0.25**2 < errors[0]
+
+
+class _Constant(Objective):
+    """Shall be 1 everywhere; the step of Adam's parameters is 0, that of matrices always at its peak."""
+
+    def __init__(self, network: MultiscaleSDF, turn: float) -> None:
+        others, *hidden = siren_groups(network, 1e-3, turn)
+        self.rates = [max(map(group.rate, np.linspace(0, 1, 101))) for group in (others, *hidden)]
+        pairs = zip(hidden, self.rates[1:], strict=True)
+        peaks = [group._replace(rate=lambda _, rate=rate: rate) for group, rate in pairs]
+        super().__init__(network, [others._replace(rate=lambda _: 0.0), *peaks], torch.Generator().manual_seed(0))
+        self.field = network
+
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        loss = (self.field.value(torch.rand(256, 3, generator=self.generator)) - 1).square().mean()
+        return {"loss": loss}, loss
+
+
+def test_a_step_changes_phases_by_the_turn_whatever_the_frequency_and_width() -> None:
+    torch.manual_seed(0)
+    sizes = [(16, 3), (64, 3), (8, 1)]
+    field = MultiscaleSDF.from_widths(sizes, omegas=(5.0, 80.0, 9.0), deltas=[10.0, 10.0])
+    learner = _Constant(field, 0.4)
+    _, *hidden = learner.groups
+    grouped = [id(parameter) for group in learner.groups for parameter in group.parameters]
+    assert sorted(grouped) == sorted(id(parameter) for parameter in field.parameters())
+    assert [[matrix.shape for matrix in group.parameters] for group in hidden] == [[(w, w)] * 2 for w, _ in sizes[:2]]
+    assert [group.matrices for group in learner.groups] == [False, True, True]
+    assert learner.rates == pytest.approx([1e-3, 0.4 / 5, 0.4 / 80], rel=1e-2)
+    before = [matrix.detach().clone() for group in hidden for matrix in group.parameters]
+    Trainer(learner, stage="constant", steps=1).run()
+    omegas = (5.0, 5.0, 80.0, 80.0)
+    after = [matrix.detach() for group in hidden for matrix in group.parameters]
+    for omega, old, new in zip(omegas, before, after, strict=True):
+        change = omega * torch.linalg.svdvals(new - old).max()  # of phases, over the norm of the input
+        assert 0.25 < float(change) < 1.21 * 0.4
+
+
+def test_frozen_levels_and_networks_without_hidden_matrices_are_left_to_nobody_and_to_adam() -> None:
+    field = MultiscaleSDF.from_widths([(8, 2), (8, 2)], omegas=(5.0, 9.0), deltas=[1.0])
+    field.base.requires_grad_(False)
+    others, hidden = siren_groups(field, 1e-3, 0.4)
+    found = {id(parameter) for group in (others, hidden) for parameter in group.parameters}
+    assert found == {id(parameter) for parameter in field.levels[1].parameters()}
+    for network, turn in ((field, 0.0), (Siren(8, 1), 0.4), (nn.Linear(8, 8), 0.4)):
+        (alone,) = siren_groups(network, 1e-3, turn)
+        assert not alone.matrices
+
+
+def test_a_step_that_is_not_taken_changes_neither_matrix_nor_momentum() -> None:
+    torch.manual_seed(0)
+    matrix, lazy = nn.Parameter(torch.randn(6, 6)), nn.Parameter(torch.randn(6, 6))
+    optimiser = Muon([{"params": [matrix, lazy], "lr": 0.1}])
+    for skipped in (False, True, False):
+        before = matrix.detach().clone(), optimiser.state[matrix].get("momentum", torch.zeros(6, 6)).clone()
+        optimiser.found_inf = torch.tensor(float(skipped))
+        matrix.grad = torch.randn(6, 6)
+        optimiser.step()
+        after = matrix.detach(), optimiser.state[matrix]["momentum"]
+        assert all(torch.equal(old, new) is skipped for old, new in zip(before, after, strict=True))
+    assert lazy not in optimiser.state  # without a gradient, as of a level that is not yet switched on
 
 
 STRIP = 16
