@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import InputError
-from ..cameras import COEFFICIENTS, Camera, intrinsics, pinhole_intrinsics
+from ..cameras import COEFFICIENTS, Camera, Float64, intrinsics, pinhole_intrinsics
 from ..files import decoded, finite_number, read_json, readable
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

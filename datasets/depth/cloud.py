@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ...neural_fields.backend.errors import renamed
-from ..clouds.point_cloud import PointCloud, colors_from, select, spread, thin
+from ..clouds.point_cloud import Float64, Int64, PointCloud, colors_from, select, spread, thin
 from ..clouds.readers.reading import MIN_POINTS
 from .cleaning import edge_pixels, grid_normals, measure_noise, smooth_depth, specks
 from .frame import RgbdFrame
 
-Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
 from ...neural_fields.backend.files import files_in
-from ..cameras import OPENGL, Camera, rigid_pose
+from ..cameras import OPENGL, Camera, Float64, rigid_pose
 from ..files import decoded, read_json, readable
 from ..views.images import read_shots
 from .camera import DepthCamera, read_intrinsics
 from .images import fit_color, read_color, read_depth
 
-Float64 = NDArray[np.float64]
 PosedFrame = tuple[str | None, Float64, DepthCamera | None]
 """Name of the frame's image, if the file has names; its world_from_camera (4, 4), NaN for a frame whose pose was lost;
 its lens, if the file has one."""

@@ -9,9 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import Field, Similarity
-from ..clouds.point_cloud import PointCloud, unit_rows
-
-Float64 = NDArray[np.float64]
+from ..clouds.point_cloud import Float64, PointCloud, unit_rows
 
 
 def sample_surface(

@@ -17,13 +17,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...neural_fields import Field, Similarity
-from ..clouds.point_cloud import PointCloud, unit_rows
-from ..depth.cleaning import both_sides
+from ..clouds.point_cloud import Float64, PointCloud, unit_rows
+from ..depth.cleaning import Mask, both_sides
 from .samples import jet_at
 from .statue import Statue
-
-Float64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 STATUE_PLACEMENT = Similarity((1250.0, -840.0, 930.0), 480.0)
 """From the statue's unit sphere to the millimetres of the bundled scan."""

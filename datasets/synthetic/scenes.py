@@ -16,16 +16,14 @@ from ...neural_fields import Box, Capsule, Field, FunctionField, Similarity, Sph
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ...neural_fields.meshing.extract import Mesh, extract_mesh
 from ...neural_fields.tracing.sphere import Hits
-from ..cameras import UP_AXES, Camera, look_at
+from ..cameras import UP_AXES, Camera, Float64, look_at
 from ..clouds.cleaning.orientation import fibonacci_directions
 from ..views.formats.shots import DepthMap
-from ..views.images import PosedImage, PosedImages
+from ..views.images import Float32, PosedImage, PosedImages
 from .corner import corner, corner_colors
 from .samples import sample_surface
 from .statue import Statue
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Rgb = tuple[float, float, float]
 Size = int | tuple[int, int]  # width and height of images in pixels, or one number for both
 

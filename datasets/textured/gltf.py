@@ -24,10 +24,7 @@ from ...neural_fields import InputError
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ...neural_fields.meshing.glb import GENERATOR
 from ..clouds.readers.meshes import strips, triangulate
-from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
+from .mesh import Float64, Int64, Paint, TexturedMesh, Wrap, decode_texture, pack
 
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}

@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 from ...neural_fields import InputError
 from ..clouds.readers.meshes import ObjText, triangulate
 from ..files import decoded
-from .mesh import Paint, TexturedMesh, decode_texture, pack
-
-Float64 = NDArray[np.float64]
+from .mesh import Float64, Paint, TexturedMesh, decode_texture, pack
 
 
 class _Material(NamedTuple):

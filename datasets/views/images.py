@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError, Similarity
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
-from ..cameras import Camera, intrinsics
+from ..cameras import Camera, Float64, intrinsics
 from ..files import read_rgb, readable, to_bytes, unit_range
 from .formats.colmap import find_model, find_models, read_colmap, read_colmap_points
 from .formats.neus import read_neus, read_neus_sphere
@@ -31,7 +31,6 @@ OPAQUE = 0.999  # an opacity of 1 after resampling
 EXACT = 0.01  # pixels that distorting an undistorted point may miss it by
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 N = TypeVar("N", NDArray[np.float32], NDArray[np.float32] | None)
 
 

@@ -12,9 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import Similarity
-from ..cameras import Camera
-
-Float64 = NDArray[np.float64]
+from ..cameras import Camera, Float64
 
 
 @dataclass(frozen=True)

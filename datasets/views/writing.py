@@ -24,8 +24,6 @@ from ...neural_fields.backend.files import check_place
 from ..cameras import OPENGL, Camera
 from .images import PosedImage, PosedImages
 
-Float64 = NDArray[np.float64]
-
 PINHOLE = 1  # COLMAP's number for the model with fx, fy, cx, cy
 GREY = 128  # the colour of sparse points, whose own colour is unknown
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ...datasets.cameras import Camera, turntable
+from ...datasets.cameras import Camera, Float64, turntable
 from ...datasets.textured.mesh import TexturedMesh
 from ...datasets.views.images import read_cameras
 from ...neural_fields import Field, InputError, Similarity, WorldField
@@ -32,8 +32,6 @@ from .picture import Image, check_picture_path, contact_sheet, write_picture
 from .rasterise import cloud_view, mesh_view, read_painted
 from .shade import SCALES, ShadeOptions, compose, default_shading, downsample, measure, shade, value_limits
 from .trace import Seen, fine_strips, trace_view
-
-Float64 = NDArray[np.float64]
 
 FRAME_RESOLUTION = 128  # of the mesh that says what the camera has to look at
 

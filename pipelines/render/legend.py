@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...datasets.files import to_bytes
 from .picture import Image
-from .slice import FINEST, STYLE, Color, Slice, distance_color, level_color, round_step
+from .slice import FINEST, STYLE, Color, Floats, Slice, distance_color, level_color, round_step
 
 NAMES = str.maketrans({"δ": "delta", "−": "-", "–": "-", "°": " deg", "·": " "})
 STROKES = 30  # size of the type whose capitals are as high as those of the strokes at scale 1, 22 pixels
@@ -42,8 +42,6 @@ def _drawable(words: str) -> str:
     """Words that OpenCV can draw: from version 5 on all that we write; an environment with nerfstudio has 4.10."""
     return words if hasattr(cv2, "FontFace") else plain(words)
 
-
-Floats = NDArray[np.float32]
 
 INK: Color = (0.20, 0.22, 0.27)  # ink on light paper
 LIGHT: Color = (0.92, 0.93, 0.95)  # and on dark paper

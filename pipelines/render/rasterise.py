@@ -13,14 +13,12 @@ from ...datasets.clouds.readers.meshes import vertex_normals
 from ...datasets.textured.reading import TexturedMesh, colors_at, read_textured
 from ...neural_fields import InputError, Mesh
 from ..surface.distance import barycentric_of_nearest
-from ..surface.raster import clip, cover
+from ..surface.raster import Float64, Int64, clip, cover
 from ..surface.surface import read_surface
 from .picture import Image
 from .shade import ShadeOptions, compose, default_shading, downsample, shade
 from .trace import Seen
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 Painted = Mesh | TexturedMesh
 
 

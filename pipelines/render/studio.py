@@ -10,20 +10,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...datasets.cameras import Camera
+from ...datasets.cameras import Camera, Float64
 from ...datasets.clouds.readers.meshes import vertex_normals
 from ...datasets.synthetic.scenes import Size, cameras_around, developed, lit
 from ...datasets.textured.mesh import TexturedMesh
 from ...datasets.views.formats.shots import DepthMap
-from ...datasets.views.images import PosedImage, PosedImages
+from ...datasets.views.images import Float32, PosedImage, PosedImages
 from ...neural_fields import InputError, Mesh, Similarity
 from ...neural_fields.meshing.color_space import srgb_to_linear
 from ..surface.surface import read_reference, sample_points
 from .rasterise import Painted, mesh_view, read_painted
 from .trace import Seen, fine_strips
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 CLAY = 0.7  # display grey of a mesh without colours
 # Pixels from a point that is seen to the tangent plane of what the middle of its pixel sees, and to that place itself,

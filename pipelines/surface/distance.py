@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ...datasets.clouds.point_cloud import sums_by
+from ...datasets.clouds.point_cloud import Float64, Int64, sums_by
 from ...neural_fields import Jet, Mesh
 from ...neural_fields.fields.field import OneLevelField
 from .surface import face_normals, is_closed, volume
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 
 class MeshDistance:

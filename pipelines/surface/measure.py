@@ -15,11 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...neural_fields import InputError, Mesh, Similarity
-from .raster import cover
+from .raster import Float64, Int64, cover
 from .surface import components, is_closed, read_surface, sample_points
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 ViewCounts = Callable[[Mesh, Float64], Int64]
 """How many photographs see points ``(N, 3)`` of the reference, both in its own coordinates; ``(N,)``."""

@@ -16,14 +16,11 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...datasets import PointCloud, read_cloud, spacing_of
-from ...datasets.clouds.point_cloud import spread_on_faces, unit_rows, voxel_representatives
+from ...datasets.clouds.point_cloud import Float64, spread_on_faces, unit_rows, voxel_representatives
 from ...datasets.clouds.readers.reading import read_mesh
 from ...datasets.textured.gltf import read_gltf
 from ...neural_fields import InputError, Mesh, Similarity
 from ..training.folder import FIELD_FILE, SUPPORT_FILE, load_state, read_record
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 

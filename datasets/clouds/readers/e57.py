@@ -11,14 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ....neural_fields import InputError
-from ..point_cloud import PointCloud, color_scale
+from ..point_cloud import Float64, PointCloud, color_scale
 from .columns import Table, choose_layout, cloud_from
 
-Float64 = NDArray[np.float64]
 _READ = re.compile(r"(cartesian|spherical|color|nor:normal)\w+")
 _COLORS = ("colorRed", "colorGreen", "colorBlue")
 

@@ -15,12 +15,9 @@ from numpy.typing import NDArray
 from ....neural_fields import InputError
 from ....neural_fields.meshing.mesh import weld
 from ...files import decoded
-from ..point_cloud import PointCloud, colors_from, sums_by, unit_rows
+from ..point_cloud import Float64, Int64, PointCloud, colors_from, sums_by, unit_rows
 from .columns import Table, choose_layout, cloud_from
 from .tables import numbers
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 
 def read_stl(path: Path) -> tuple[PointCloud, Int64]:

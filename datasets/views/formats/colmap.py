@@ -18,10 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from ....neural_fields import InputError
 from ....neural_fields.backend.files import natural
-from ...cameras import Camera, intrinsics
+from ...cameras import Camera, Float64, intrinsics
 from .shots import IMAGE_SUFFIXES, Shot
 
-Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 MODELS = {  # name: number of parameters; the order is that of the binary files' numbers
