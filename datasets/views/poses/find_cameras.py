@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -111,8 +109,11 @@ def _sharpest(film: Path, images: Path, frames: int, report: Report) -> None:
     half = images.with_name(".images")
     shutil.rmtree(half, ignore_errors=True)
     half.mkdir()
-    with _opened(film) as (capture, total):
-        best, count = 0.0, 0
+    capture, count, best = cv2.VideoCapture(str(film)), 0, 0.0
+    try:
+        total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+        if total < FEWEST_PHOTOGRAPHS:
+            raise InputError(f"{film}: not a film that can be read; convert it to MP4, or give a folder of photographs")
         for index in range(total):
             read, frame = capture.read()
             if not read:
@@ -131,21 +132,11 @@ def _sharpest(film: Path, images: Path, frames: int, report: Report) -> None:
                     raise InputError(f"{film}: frame {index} cannot be written as PNG")
                 place.write_bytes(data.tobytes())
             report("reading the film", index + 1, total)
+    finally:
+        capture.release()
     if count < FEWEST_PHOTOGRAPHS:
         raise InputError(f"{film}: {count} frames can be read; {FEWEST_PHOTOGRAPHS} are the least")
     half.replace(images)
-
-
-@contextmanager
-def _opened(film: Path) -> Iterator[tuple[cv2.VideoCapture, int]]:
-    capture = cv2.VideoCapture(str(film))
-    try:
-        total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
-        if total < FEWEST_PHOTOGRAPHS:
-            raise InputError(f"{film}: not a film that can be read; convert it to MP4, or give a folder of photographs")
-        yield capture, total
-    finally:
-        capture.release()
 
 
 def _reconstructed(project: Path, told: Connection, *, one: bool, film: bool) -> dict[str, Any]:
