@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
 import struct
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
-from ...neural_fields.backend.files import check_place
+from ...neural_fields.backend.files import check_place, partial_of
 from ..cameras import OPENGL, Camera
 from .images import PosedImage, PosedImages
 
@@ -172,7 +171,7 @@ def _depth_file(name: str) -> Path:
 def _new_folder(folder: str | Path, images: PosedImages) -> Iterator[Path]:
     """A folder beside the target that takes its name when all is written; depth maps are in it."""
     folder = check_new_folder(folder)
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    partial = partial_of(folder)
     try:
         partial.mkdir(parents=True)
         for name, view in _numbered(images):

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ....neural_fields import InputError
-from ....neural_fields.backend.files import check_place
+from ....neural_fields.backend.files import check_place, write_whole
 
 RECORD_FILE, DATABASE_FILE, LOG_FILE = "cameras.json", "database.db", "colmap.log"
 LARGEST_SIDE = 1600  # pixels; larger photographs are shrunk before features are extracted
@@ -94,10 +94,8 @@ def begun(project: Path, asked: dict[str, Any]) -> Found | None:
 def write_record(project: Path, asked: dict[str, Any], found: Found | None) -> None:
     """Write the request, and the result under ``found`` if there is one, in one step."""
     record = asked if found is None else asked | {"found": asdict(found)}
-    half = project / f".{RECORD_FILE}"
     text = json.dumps(record, indent=1, default=lambda _: "")  # the only path is that of the project, which may move
-    half.write_text(text, encoding="utf-8")
-    half.replace(project / RECORD_FILE)
+    write_whole(project / RECORD_FILE, text)
 
 
 def solve(project: Path, job: Job, *, photographs: int, pairs: int, report: Report) -> dict[str, Any]:
