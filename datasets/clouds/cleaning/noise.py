@@ -179,11 +179,11 @@ def smooth_along_normals(points: Float64, normals: Float64, level: float, *, ali
 
 
 class _Layer:
-    """A tree of the points ``among`` of a cloud."""
+    """A tree of the points ``among`` of a cloud; ``tree`` is that, if there is one already."""
 
-    def __init__(self, points: Float64, normals: Float64, among: Int64) -> None:
+    def __init__(self, points: Float64, normals: Float64, among: Int64, tree: KDTree | None = None) -> None:
         self.points, self.normals, self.among = points, normals, among
-        self.tree = KDTree(points[among])
+        self.tree = tree or KDTree(points[among])
 
     def around(self, rows: Int64, count: int, *, within: float = np.inf) -> _Neighbors:
         """The ``count`` nearest to the points ``rows``, but not those themselves."""
@@ -262,19 +262,15 @@ def sharper_normals(points: Float64, normals: Float64) -> Float64:
 def _disagreement(points: Float64, normals: Float64, tree: KDTree) -> float:
     """The mean of |h_ij| / |p_j − p_i| over the eight nearest neighbours of a sample."""
     some = np.random.default_rng(0).permutation(len(points))[: REFIT.sample]
-    distance, near = query(tree, points[some], 9)
-    distance, near = distance[:, 1:], near[:, 1:]
-    offset = points[near] - points[some][:, None]
-    product = np.einsum("mkd,mkd->mk", offset, normals[near] + normals[some][:, None]) / 2
-    return float((np.abs(product) / np.maximum(distance, 1e-300)).mean())
+    near = _Layer(points, normals, np.arange(len(points)), tree).around(some, 8)
+    return float(np.nanmean(np.abs(near.height) / np.maximum(near.distance, 1e-300)))
 
 
 def has_edges(points: Float64, normals: Float64, *, tree: KDTree | None = None) -> bool:
     """Whether normals turn by much at few places, as at the edges between faces, and not everywhere by some."""
     some = np.random.default_rng(0).permutation(len(points))[: REFIT.sample]
-    near = query(tree or KDTree(points), points[some], 9)[1][:, 1:]
-    cosine = np.einsum("md,mkd->mk", normals[some], normals[near])
-    angle = np.arccos(cosine.clip(-1, 1)).mean(axis=1)
+    cosine = _Layer(points, normals, np.arange(len(points)), tree).around(some, 8).cosine
+    angle = np.nanmean(np.arccos(cosine.clip(-1, 1)), axis=1)
     usual, large = np.quantile(angle, (0.5, 0.9))
     return bool(large > REFIT.edged * usual)
 
