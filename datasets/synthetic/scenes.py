@@ -56,11 +56,6 @@ class Scene:
     frontal: bool = False
 
 
-def scene_cameras(scene: Scene, *, views: int = 24, size: Size = 64, seed: int = 0) -> list[Camera]:
-    """`cameras_around` a scene."""
-    return cameras_around(scene.radius, up=scene.up, views=views, size=size, seed=seed, frontal=scene.frontal)
-
-
 def render_scene(
     scene: Scene,
     views: int = 24,
@@ -89,7 +84,7 @@ def render_scene(
     Raises:
         ValueError: ``views``, ``size`` or ``samples`` is not positive.
     """
-    cameras = scene_cameras(scene, views=views, size=size, seed=seed)
+    cameras = cameras_around(scene.radius, up=scene.up, views=views, size=size, seed=seed, frontal=scene.frontal)
     together = max(1, RAYS_AT_ONCE // max(1, cameras[0].width * cameras[0].height * samples**2))
     images: list[PosedImage] = []
     for first in range(0, views, together):

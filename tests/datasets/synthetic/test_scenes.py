@@ -152,8 +152,8 @@ def test_all_of_the_shape_is_in_view(name):
 
 
 def test_cameras_are_even_upright_and_held_out_by_seed(sphere):
-    cameras = scenes.scene_cameras(sphere, views=50, size=8, seed=1)
-    again, other = (scenes.scene_cameras(sphere, views=50, size=8, seed=seed) for seed in (1, 2))
+    cameras = scenes.cameras_around(sphere.radius, views=50, size=8, seed=1)
+    again, other = (scenes.cameras_around(sphere.radius, views=50, size=8, seed=seed) for seed in (1, 2))
     eyes, again, other = (torch.stack([camera.eye for camera in some]) for some in (cameras, again, other))
     assert torch.allclose(eyes.norm(dim=1), torch.tensor(2.4, dtype=torch.float64))
     assert float(eyes.mean(dim=0).norm()) < 0.05
@@ -166,7 +166,7 @@ def test_cameras_are_even_upright_and_held_out_by_seed(sphere):
 
 def test_frontal_cameras_are_even_and_in_front():
     scene = SCENES["corner"]()
-    cameras = scenes.scene_cameras(scene, views=49, size=(40, 30), seed=1)
+    cameras = scenes.cameras_around(scene.radius, views=49, size=(40, 30), seed=1, frontal=scene.frontal)
     assert {(camera.width, camera.height) for camera in cameras} == {(40, 30)}
     towards = torch.nn.functional.normalize(torch.stack([camera.eye for camera in cameras]), dim=1)
     azimuth, rise = torch.rad2deg(torch.atan2(towards[:, 0], towards[:, 2])), torch.rad2deg(towards[:, 1].asin())
