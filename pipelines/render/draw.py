@@ -28,7 +28,7 @@ from ..texture.transport import Colors, colors_of_run
 from ..training.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
-from .picture import Image, check_picture_path, contact_sheet, write_picture
+from .picture import Color, Image, check_picture_path, contact_sheet, write_picture
 from .rasterise import cloud_view, mesh_view, read_painted
 from .shade import SCALES, ShadeOptions, compose, default_shading, downsample, measure, shade, value_limits
 from .trace import Seen, fine_strips, trace_view
@@ -260,7 +260,6 @@ def choose_frame(file: str | Path, named: Sequence[tuple[str, Camera]], frame: s
     raise InputError(f"--frame {frame}: {file} {some}; none, or more than one, is called that")
 
 
-Color = tuple[float, float, float]
 Painter = Callable[[Camera, int], Image]
 """What a camera, in unit-sphere coordinates, sees of a level: a picture of its size."""
 

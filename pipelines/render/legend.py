@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.files import to_bytes
-from .picture import Image
-from .slice import FINEST, STYLE, Color, Floats, Slice, distance_color, level_color, round_step
+from .picture import Color, Image
+from .slice import FINEST, STYLE, Floats, Slice, distance_color, level_color, round_step
 
 NAMES = str.maketrans({"δ": "delta", "−": "-", "–": "-", "°": " deg", "·": " "})
 STROKES = 30  # size of the type whose capitals are as high as those of the strokes at scale 1, 22 pixels

@@ -14,6 +14,7 @@ from ...neural_fields import InputError
 from ...neural_fields.backend.files import check_place, write_whole
 
 Image = NDArray[np.uint8]
+Color = tuple[float, float, float]
 Titled = tuple[str, Image]
 
 

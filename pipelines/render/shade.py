@@ -20,7 +20,7 @@ from ...datasets.cameras import Camera
 from ...neural_fields import Field
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, ball_crossing
 from ..training.settings import SHADINGS, ShadeOptions
-from .picture import Image
+from .picture import Color, Image
 from .trace import Seen
 
 Float32 = NDArray[np.float32]
@@ -114,8 +114,6 @@ def level_set_curvature(field: Field, points: Tensor, *, level: int = -1, step: 
     ahead, behind = (normalize(field.jet(points + o, level=level).gradient, dim=-1) for o in (offsets, -offsets))
     return (ahead - behind).diagonal(dim1=0, dim2=2).sum(-1) / (4 * step)
 
-
-Color = tuple[float, float, float]
 
 GAMMA = 2.2  # between display values, in which images are stored, and light, which adds up
 

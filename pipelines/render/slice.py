@@ -16,11 +16,10 @@ from torch import Tensor
 
 from ...datasets.files import to_bytes
 from ...neural_fields import Field
-from .picture import Image
+from .picture import Color, Image
 
 Array = NDArray[np.floating]
 Floats = NDArray[np.float32]
-Color = tuple[float, float, float]
 Vector = Sequence[float] | NDArray[np.float64]
 
 # Near the surface and far from it; blue outside, orange inside.
