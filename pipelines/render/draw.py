@@ -54,9 +54,9 @@ class Subject:
         field: what is traced; None for a mesh or a cloud.
         colored: whether it has colours of its own.
         oriented: whether it has normals.
-        fitted_to: finds the fitted cloud, or raises an InputError; None for a mesh or a cloud.
         outline: points ``(N, 3)`` that a camera has to have in view.
         view: what the pixels of a camera see.
+        fitted_to: finds the fitted cloud, or raises an InputError; None for a mesh or a cloud.
     """
 
     name: Path
@@ -65,9 +65,9 @@ class Subject:
     field: Field | None
     colored: bool
     oriented: bool
-    fitted_to: Callable[[], Path] | None
     outline: Callable[[], Float64]
     view: Callable[[Camera, Panel], Seen]
+    fitted_to: Callable[[], Path] | None = None
 
 
 def open_subject(source: str | Path, options: RenderOptions | None = None) -> Subject:
@@ -116,7 +116,6 @@ def subject_of(
         field=field,
         colored=colors is not None,
         oriented=True,
-        fitted_to=None,
         outline=lambda: _outline(name, field),
         view=view,
     )
@@ -164,7 +163,6 @@ def _surface_subject(file: Path) -> Subject:
         field=None,
         colored=isinstance(surface, TexturedMesh) or surface.colors is not None,
         oriented=isinstance(surface, TexturedMesh) or solid or surface.normals is not None,
-        fitted_to=None,
         outline=lambda: similarity.to_unit(used),
         view=view,
     )

@@ -93,7 +93,6 @@ class _Server(ThreadingTCPServer):
     """The sockets of a `PageServer`, a thread for each request."""
 
     daemon_threads = True
-    block_on_close = False
     allow_reuse_address = True
 
     def __init__(self, address: tuple[Any, ...], family: int, page: PageServer) -> None:
