@@ -26,26 +26,22 @@ class Pairs:
     def __init__(self, runs: Sequence[str | Path], path: str | Path, *, up: str = "y") -> None:
         self.path, self.runs, self.up = Path(path), runs, up
         self.saved = [load_still(run) for run in runs]
+        self.places = [Similarity((side - 0.5, 0.0, 0.0), 0.5) for side in range(2)]  # of the shapes on the page
         self.pairs = np.zeros((0, 2, 3))
         if self.path.exists():
             self.pairs = np.stack(read_landmarks(self.path), axis=1)
 
     def pack(self) -> Packed:
         """Pack both shapes and the pairs."""
-        shapes, names = [], []
-        for side, (run, saved) in enumerate(zip(self.runs, self.saved, strict=True)):
+        shapes, names, marks = [], [], []
+        sides = zip(self.runs, self.saved, self.places, self.pairs.swapaxes(0, 1), strict=True)
+        for run, saved, place, points in sides:
             mesh = field_shapes(saved.field, texture_of(find_field(run), saved.field))[-1]
             names.append(Path(run).resolve().stem)
-            shapes.append(replace(mesh, name=names[-1], vertices=0.5 * mesh.vertices + self._shift(side)))
+            shapes.append(replace(mesh, name=names[-1], vertices=place.to_input(mesh.vertices)))
+            marks.append(place.to_input(saved.similarity.to_unit(points)))
         packed = pack_shapes(shapes, Similarity.identity(), WebOptions(up=self.up), name=" and ".join(names))
-        scene = [
-            [
-                (0.5 * saved.similarity.to_unit(point) + self._shift(side)).tolist()
-                for side, (saved, point) in enumerate(zip(self.saved, pair, strict=True))
-            ]
-            for pair in self.pairs
-        ]
-        packed.header["landmarks"] = {"names": names, "pairs": scene}
+        packed.header["landmarks"] = {"names": names, "pairs": np.stack(marks, axis=1).tolist()}
         return packed
 
     def keep(self, pairs: Any) -> None:
@@ -59,17 +55,14 @@ class Pairs:
             raise ValueError("landmarks: expected a list of pairs of points") from error
         if places.shape not in ((0,), (len(places), 2, 3)) or not np.isfinite(places).all():
             raise ValueError("landmarks: expected a list of pairs of finite points")
-        places = places.reshape(-1, 2, 3)
         sides = [
-            saved.similarity.to_input((places[:, side] - self._shift(side)) / 0.5)
-            for side, saved in enumerate(self.saved)
+            saved.similarity.to_input(place.to_unit(points))
+            for saved, place, points in zip(
+                self.saved, self.places, places.reshape(-1, 2, 3).swapaxes(0, 1), strict=True
+            )
         ]
         self.pairs = np.stack(sides, axis=1)
         if len(places):
             write_landmarks(self.path, *sides)
         else:
             self.path.unlink(missing_ok=True)
-
-    @staticmethod
-    def _shift(side: int) -> np.ndarray:
-        return np.array([side - 0.5, 0.0, 0.0])
