@@ -66,13 +66,10 @@ def find_model(folder: Path) -> Path | None:
 
 def find_models(folder: Path) -> list[Path]:
     """The models in ``sparse/*``, in natural order; where there are none there, in ``sparse`` or the folder itself."""
-
-    def is_model(place: Path) -> bool:
-        return any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
-
     sparse = folder / "sparse"
     numbered = sorted(sparse.iterdir(), key=lambda place: natural(place.name)) if sparse.is_dir() else []
-    return list(filter(is_model, numbered)) or list(filter(is_model, (sparse, folder)))[:1]
+    models = [place for place in numbered if _find(place, "cameras")]
+    return models or [place for place in (sparse, folder) if _find(place, "cameras")][:1]
 
 
 def _count_images(model: Path) -> int:
@@ -111,11 +108,9 @@ def read_colmap_points(model: Path) -> tuple[Float64, Int64] | None:
 
     Images are numbered in the order of `read_colmap`. None if the model has no points.
     """
-    binary, text = model / "points3D.bin", model / "points3D.txt"
-    if not binary.is_file() and not text.is_file():
+    if (path := _find(model, "points3D")) is None:
         return None
-    path = binary if binary.is_file() else text
-    points, seen = _binary_points(path) if path is binary else _text_points(path)
+    points, seen = _binary_points(path) if path.suffix == ".bin" else _text_points(path)
     if not np.isfinite(points).all():
         raise InputError(f"{path}: holds a number that is not finite; export it again")
     if not len(points):
@@ -127,11 +122,15 @@ def read_colmap_points(model: Path) -> tuple[Float64, Int64] | None:
     return points, np.column_stack((at, seen[:, 1]))[numbers[at] == seen[:, 0]]
 
 
+def _find(model: Path, kind: str) -> Path | None:
+    """The binary file of that kind, or else the text."""
+    return next(filter(Path.is_file, (model / f"{kind}.bin", model / f"{kind}.txt")), None)
+
+
 def _part(model: Path, kind: str) -> Path:
-    for suffix in (".bin", ".txt"):
-        if (model / f"{kind}{suffix}").is_file():
-            return model / f"{kind}{suffix}"
-    raise InputError(f"{model}: neither {kind}.bin nor {kind}.txt in it; export the model again")
+    if (found := _find(model, kind)) is None:
+        raise InputError(f"{model}: neither {kind}.bin nor {kind}.txt in it; export the model again")
+    return found
 
 
 def _poses(images: Path) -> list[_Pose]:
