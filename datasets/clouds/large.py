@@ -108,10 +108,8 @@ def merge_cloud(
     groups, size = _grouped(stream, frame, voxel or _first_size(frame, limit), limit)
     before = groups.sums[:, 0].sum()
     groups = groups if isolation is None else _without_isolated(groups, isolation)
-    rows = _without_scraps(_along_normals(groups), size)
-    while len(rows) > limit:
+    while len(rows := _without_scraps(_along_normals(groups), size)) > limit:
         groups, size = _coarser(groups), 2 * size
-        rows = _without_scraps(_along_normals(groups), size)
     count = rows[:, :1]
     cloud = PointCloud(
         rows[:, 1:4] / count + frame.low,
