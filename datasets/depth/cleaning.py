@@ -37,9 +37,8 @@ def _breaks(depth: Float64, axis: int, *, pixel_angle: float, jump: float, incid
     """
     z = np.moveaxis(depth, axis, 1)
     step = np.diff(z, axis=1)
-    nothing = np.full((len(z), 1), np.nan)
-    before = np.concatenate((nothing, step[:, :-1]), axis=1)
-    after = np.concatenate((step[:, 1:], nothing), axis=1)
+    beside = np.pad(step, ((0, 0), (1, 1)), constant_values=np.nan)
+    before, after = beside[:, :-2], beside[:, 2:]
     way = np.sign(step)
     # fmin ignores a missing reading on one side.
     along = np.nan_to_num(np.fmin(before * way, after * way)).clip(min=0)

@@ -197,8 +197,7 @@ def scan_with_truth(
 def _in_place(motion: Float64, place: Similarity) -> Float64:
     """A rigid motion of the field's coordinates as one of the scan's."""
     moved = motion.copy()
-    middle = place.to_input(np.zeros((1, 3)))[0]
-    moved[:3, 3] = place.to_input(motion[None, :3, 3])[0] - motion[:3, :3] @ middle
+    moved[:3, 3] = place.to_input(motion[:3, 3]) - motion[:3, :3] @ place.center
     return moved
 
 
