@@ -244,7 +244,7 @@ def test_a_level_is_unsettled_if_it_is_not_better_and_one_of_its_errors_not_sign
     assert all(verdict.unsettled for verdict in unsure)
     assert not any(verdict._replace(noisy=True, guessed=True).unsettled for verdict in unsure)
     assert not verdict_of(-3.0, -5.0)._replace(after=worse).unsettled
-    assert not any(verdict_of(*falls).unsettled for falls in ((5.0, -3.0), (3.0, 0.0)))  # better by the loss, and by both
+    assert not any(verdict_of(*falls).unsettled for falls in ((5.0, -3.0), (3.0, 0.0)))  # better
 
 
 def test_noisy_points_judge_by_their_mean_distance_beyond_the_band_too() -> None:
