@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import resource
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +33,10 @@ Float64 = NDArray[np.float64]
 
 TILED, SINGLE, POISSON = "tiles", "one network", "screened Poisson"
 EDGE = 4.0  # metres at the rim of the town, where the ground ends and nothing is compared
+DEPTH = 0.5  # metres below the ground, from which on nothing is compared
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class TilesRow:
     """One method on one town; lengths are in metres.
 
@@ -72,7 +73,7 @@ class TilesRow:
     open_edges: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class TilesBench(Benchmark[TilesRow]):
     """One town scanned from the air and from a car.
 
@@ -159,7 +160,9 @@ class TilesBench(Benchmark[TilesRow]):
                 inside, border = float(off[kept & ~blended].mean()), float(off[kept & blended].mean())
         assert mesh is not None
         placed = mesh.moved(_back(similarity))
-        found, _ = sample_points(placed, self.eval_samples, np.random.default_rng(3))
+        above = (placed.vertices[:, 2] > town.height(placed.vertices[:, :2]) - DEPTH)[placed.faces].any(axis=1)
+        seen = dataclasses.replace(placed, faces=placed.faces[above])  # so that an underside takes no samples
+        found, _ = sample_points(seen, self.eval_samples, np.random.default_rng(3))
         floor = [*_both_ways(again, truth, town)]
         accuracy, completeness = _both_ways(found, truth, town)
         return [
@@ -226,8 +229,8 @@ def _box(town: Town, similarity: Similarity) -> Any:
 
 def _away(points: Float64, town: Town) -> NDArray[np.bool_]:
     """Which points are not at the rim of the town, nor below its ground, where meshes are closed in some way."""
-    low = town.triangles[..., 2].min() - 0.5
-    return ((points[:, :2] > EDGE) & (points[:, :2] < town.size - EDGE)).all(axis=1) & (points[:, 2] > low)
+    within = ((points[:, :2] > EDGE) & (points[:, :2] < town.size - EDGE)).all(axis=1)
+    return within & (points[:, 2] > town.height(points[:, :2]) - DEPTH)
 
 
 def _both_ways(found: Float64, truth: Float64, town: Town) -> tuple[float, float]:

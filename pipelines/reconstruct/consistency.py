@@ -3,6 +3,8 @@
 Two photographs that show the same texture place a surface to a fraction of a pixel. A pixel's surface point and normal
 give a tangent plane. If it is right, its homography maps the patch around the pixel onto the same patch of a neighbour.
 Sources: Goesele et al. 2007; for neural surfaces Fu et al., "Geo-Neus", 2022.
+
+Where photographs are plain nothing places a surface. There it shall be flat, see `flatness_loss`.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import torch
 from torch import Tensor
 
 from ...datasets.views.images import PosedImage
+from ...neural_fields.backend.devices import few_numbers, uniform
 from ...neural_fields.fields.field import FieldLike, as_field
 
 
@@ -41,6 +44,11 @@ class ConsistencyOptions:
     clearance: float = 0.04  # from which on a ray to a neighbour is tested for occlusion, in radii of the region
     marches: int = 10  # steps of that test
     stride: float = 0.02  # least length of a step, in radii of the region
+    flatness: float = 0.6  # weight of `flatness_loss` over that of `consistency_loss`
+    nearest: float = 0.02  # from a surface point to where it is compared with the tangent plane, in radii of the region
+    furthest: float = 0.3  # the same at most
+    plain: float = 0.02  # standard deviation of grey values in [0, 1] that are alike
+    bend: float = 0.05  # changes of slope below which errors count by their squares
 
 
 class Surface(NamedTuple):
@@ -167,11 +175,11 @@ def choose_neighbours(
 
 
 def _projected(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Pixels ``(R, V, 2)`` and depths ``(R, V)`` of points ``(R, 1, 3)`` in all cameras."""
-    seen = torch.einsum("rvi,vij->rvj", points - cameras.eyes, cameras.axes)
+    """Pixels ``(R, V, 2)`` and depths ``(R, V)`` of points ``(R, 1, 3)`` in all cameras, or ``(R, V, 3)`` in one."""
+    seen = torch.einsum("...i,...ij->...j", points - cameras.eyes, cameras.axes)
     depth = seen[..., 2]
     slopes = seen[..., :2] / torch.where(depth > 0, depth, 1.0)[..., None]
-    return slopes * cameras.lens[:, :2] + cameras.lens[:, 2:], depth
+    return slopes * cameras.lens[..., :2] + cameras.lens[..., 2:], depth
 
 
 def warp(surface: Surface, pixels: Pixels, offsets: Tensor, neighbours: Tensor, cameras: Cameras) -> Tensor:
@@ -237,3 +245,42 @@ def consistency_loss(
     counts &= (texture > options.texture) & (alike.detach() > options.floor)
     best, row = torch.where(counts, alike, -1.0).topk(min(options.best, alike.shape[1]), dim=1)
     return torch.where(counts.gather(1, row), 1 - best, 0.0).sum(dim=1) / best.shape[1]
+
+
+def flatness_loss(
+    field: FieldLike,
+    surface: Surface,
+    pixels: Pixels,
+    cameras: Cameras,
+    pictures: GreyPictures,
+    options: ConsistencyOptions,
+    generator: torch.Generator,
+    *,
+    level: int = -1,
+) -> Tensor:
+    """How the surface bends where its picture is plain ``(R,)``: √(b² + ε²) − ε of a change of slope b.
+
+    b = (f(x + h t) + f(x − h t) − 2 f(x)) / h with a random tangent t and a random length h at each surface point x. It
+    counts as far as the photograph has one grey value at x, x ± h t / 2 and x ± h t, so not in texture or across edges.
+    """
+    rows, device = len(pixels.view), pixels.view.device
+    number, angle = uniform((2, rows), generator, device).to(surface.position)
+    length = options.nearest * (options.furthest / options.nearest) ** number
+    middle, normal = surface.position.detach(), surface.normal.detach()
+    # The axis that is least along the normal gives a first tangent, and turning it any other.
+    across = torch.nn.functional.one_hot(normal.abs().argmin(dim=1), 3).to(normal)
+    first = torch.nn.functional.normalize(torch.linalg.cross(normal, across), dim=1)
+    turn = 2 * math.pi * angle[:, None]
+    tangent = turn.cos() * first + turn.sin() * torch.linalg.cross(normal, first)
+    steps = few_numbers((-1.0, 0.0, 1.0, -0.5, 0.5), middle)
+    places = middle[:, None] + (steps * length[:, None])[..., None] * tangent[:, None]
+    with torch.no_grad():
+        own = Cameras(*(part[pixels.view][:, None] for part in cameras))
+        there, ahead = _projected(places, own)
+        view = pixels.view[:, None].expand(ahead.shape)
+        grey = pictures.at(view, there)
+        alike = torch.exp(-((grey - grey[:, 1:2]) ** 2) / (2 * options.plain**2)) * pictures.contains(view, there)
+        weight = (alike * pictures.weights(view, there.round().long()) * (ahead > 0)).prod(dim=1) * surface.found
+    value = as_field(field).value(places[:, :3].reshape(-1, 3), level=level).reshape(rows, 3)
+    bend = (value[:, 0] + value[:, 2] - 2 * value[:, 1]) / length
+    return weight * ((bend**2 + options.bend**2).sqrt() - options.bend)

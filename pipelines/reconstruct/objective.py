@@ -18,7 +18,15 @@ from ...neural_fields.volume.render import Rendered, Sampling
 from ..training.cuda_graphs import CudaGraphRecorder, GraphCache, Recorder
 from ..training.settings import ReconstructConfig
 from ..training.trainer import ErrorWeightedSampler, Group, Objective, Trainer, siren_groups, warm_cosine
-from .consistency import Cameras, ConsistencyOptions, GreyPictures, Pixels, consistency_loss, surface_near
+from .consistency import (
+    Cameras,
+    ConsistencyOptions,
+    GreyPictures,
+    Pixels,
+    consistency_loss,
+    flatness_loss,
+    surface_near,
+)
 from .measured import MeasuredDepths, depth_loss
 from .model import RayPool, Rays, SceneModel
 
@@ -225,9 +233,9 @@ class SceneObjective(Objective):
             terms["depth"] = depth
             total = total + config.depth_weight * depth
         if self.pictures is not None and kind.consistent:
-            consistency = self.consistency_term(self.pictures, rays, (origins, directions), rendered, kind.level)
-            terms["consistency"] = consistency
-            total = total + config.consistency * consistency
+            given = rays, (origins, directions), rendered
+            terms["consistency"], terms["flatness"] = self.consistency_terms(self.pictures, *given, kind.level)
+            total = total + config.consistency * (terms["consistency"] + self.patches.flatness * terms["flatness"])
         terms["uncertainty"] = 1 / self.model.inv_std
         return Outcome(terms, total, samples)
 
@@ -241,10 +249,13 @@ class SceneObjective(Objective):
         left = self.by_time(lambda done: max(1 - done / self.schedule.faded, 0.0))
         return torch.where(rays.exact, missed, left * missed).mean()
 
-    def consistency_term(
+    def consistency_terms(
         self, pictures: GreyPictures, rays: Rays, lines: tuple[Tensor, Tensor], rendered: Rendered, level: int
-    ) -> Tensor:
-        """The mean of `consistency_loss` over the first rays that meet something, along ``lines``: eyes, directions."""
+    ) -> tuple[Tensor, Tensor]:
+        """Means of `consistency_loss` and `flatness_loss` over the first rays that meet something.
+
+        ``lines`` are the eyes and directions of the rays.
+        """
         pool, poses, options = self.pool, self.model.poses, self.patches
         opaque = rendered.opacity.detach() > 0.5
         rows = first_rows(opaque, min(options.patches, len(opaque)))
@@ -262,7 +273,9 @@ class SceneObjective(Objective):
             cameras = Cameras(eyes[::3], columns.reshape(-1, 3, 3).mT, pool.lens)
         distance = self.grid or (lambda x: self.model.geometry.value(x, level=0))
         pixels = Pixels(*pool.places(rays.row[rows]))
-        return consistency_loss(surface, pixels, cameras, pictures, distance, options).mean()
+        consistency = consistency_loss(surface, pixels, cameras, pictures, distance, options)
+        seen = surface, pixels, cameras, pictures, options
+        return consistency.mean(), flatness_loss(self.model.geometry, *seen, self.generator, level=level).mean()
 
 
 CHOICES = ("samples", "colors", "outside")

@@ -18,6 +18,7 @@ from mplicits.pipelines.reconstruct.consistency import (
     choose_neighbours,
     consistency_loss,
     correlation,
+    flatness_loss,
     surface_near,
     warp,
 )
@@ -216,3 +217,46 @@ def test_what_misses_counts_nothing() -> None:
     alone = Cameras(*(part[:1] for part in cameras))
     pixel = Pixels(torch.zeros(1, dtype=torch.int64), torch.tensor([[48, 36]]))
     assert float(consistency_loss(single, pixel, alone, pictures, plane().value, OPTIONS)) == 0
+
+
+def flatness_of(field: Field, parts: tuple[Cameras, GreyPictures, list[Camera]], options=OPTIONS) -> Tensor:
+    cameras, pictures, _ = parts
+    pixels, origins, directions = pixels_and_rays(cameras)
+    surface = surface_near(field, origins, directions, torch.full((len(origins),), 2.4, dtype=torch.float64), options)
+    assert bool(surface.found.all())
+    return flatness_loss(field, surface, pixels, cameras, pictures, options, torch.Generator().manual_seed(0))
+
+
+def test_a_plane_is_flat_and_a_sphere_bends_by_its_radius_where_pictures_are_plain() -> None:
+    parts = scene(plain=True)
+    assert float(flatness_of(plane(0.1), parts).abs().max()) < 1e-12
+    radius, known = 2.0, replace(OPTIONS, newton=6, nearest=0.1, furthest=0.1 * (1 + 1e-9))
+    ball = FunctionField(lambda x: (x + radius * NORMAL.to(x)).norm(dim=-1) - radius)
+    bend = 2 * (math.hypot(radius, 0.1) - radius) / 0.1  # of each tangent alike
+    expected = math.hypot(bend, OPTIONS.bend) - OPTIONS.bend
+    found = flatness_of(ball, parts, known)
+    inside = found > 0  # all 0.1 beside it is in the picture
+    assert int(inside.sum()) > 20
+    assert torch.allclose(found[inside], torch.full_like(found[inside], expected), rtol=1e-4)  # |f(x)| < 1e-9
+    # Waves of eight to twenty pixels: hardly a tangent has one grey value at five places.
+    assert float(flatness_of(ball, scene(), replace(known, plain=0.002)).mean()) < 0.05 * expected
+
+
+def test_a_crease_stays_where_the_picture_has_an_edge_and_a_dent_goes_where_it_has_none() -> None:
+    cameras, pictures, cams = scene(plain=True)
+    bent = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    # A roof whose ridge is seen as the column in the middle of the first picture, which looks along z.
+    roof = FunctionField(lambda x: (x[..., 2] + bent * x[..., 0].abs()) / (1 + bent.square()).sqrt())
+    parts = cameras, pictures, cams
+    loss = flatness_of(roof, parts).mean()
+    (slope,) = torch.autograd.grad(loss, bent)
+    flat = float(loss.detach())
+    assert flat > 0
+    assert float(slope) > 0  # flatter is better
+    pictures.grey[0, :, WIDTH // 2 :] += 0.3
+    edges = flatness_of(roof, parts).detach()
+    # Bilinear grey values rise over one pixel, within which a crossing is not seen.
+    assert float(edges.mean()) < 0.02 * flat
+    pictures.grey[0, :, WIDTH // 2 :] -= 0.3
+    pictures.masks[:] = 0
+    assert float(flatness_of(roof, parts).detach().abs().max()) == 0

@@ -182,6 +182,7 @@ def test_photographs_are_compared_once_the_surface_exists(
     assert "consistency" not in first.losses
     train(first, until=4)
     assert 0 < first.losses["consistency"] < 2
+    assert 0 <= first.losses["flatness"] < 2
     state = {name: tensor.clone() for name, tensor in first.state().items()}
     second.restore(state)
     train(second)
