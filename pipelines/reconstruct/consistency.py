@@ -44,7 +44,7 @@ class ConsistencyOptions:
     clearance: float = 0.04  # from which on a ray to a neighbour is tested for occlusion, in radii of the region
     marches: int = 10  # steps of that test
     stride: float = 0.02  # least length of a step, in radii of the region
-    flatness: float = 0.6  # weight of `flatness_loss` over that of `consistency_loss`
+    flatness: float = 0.2  # weight of `flatness_loss` over that of `consistency_loss`
     nearest: float = 0.02  # from a surface point to where it is compared with the tangent plane, in radii of the region
     furthest: float = 0.3  # the same at most
     plain: float = 0.02  # standard deviation of grey values in [0, 1] that are alike
