@@ -307,12 +307,14 @@ def test_evaluate_tells_how_near_the_mesh_is_where_photographs_see(
     trimesh.creation.icosphere(2, radius=0.6).export(truth)
     some = ["--photos", str(tmp_path / "photos"), "--samples", "2000", "--json", str(figures)]
     assert main(["evaluate", str(truth), str(truth), *some]) == 0
-    assert "chamfer where 2 photographs see" in capsys.readouterr().out
+    printed = capsys.readouterr().out
     # A camera at four radii sees where the cosine is above 1 / 4; some 40 samples of 2000 are beside a rim.
     eyes = torch.stack([torch.nn.functional.normalize(view.camera.eye, dim=0) for view in images.views])
     once = (fibonacci_directions(20_000) @ eyes.T.numpy() > 0.25).any(axis=1).mean()
     visible = json.loads(figures.read_text())["visible"]
     assert visible["share"] == pytest.approx(once, abs=0.05)
+    assert f"{visible['share']:.2%}" in printed
+    assert all(f"{distance:.4g}" in printed for distance in visible["distances"].values())
     # The mesh is the reference: its distances are those of a sampling.
     assert visible["distances"] == pytest.approx(visible["floors"], rel=0.1)
     np.savetxt(cloud, np.random.default_rng(0).normal(size=(50, 3)))
