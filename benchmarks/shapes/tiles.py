@@ -160,7 +160,7 @@ class TilesBench(Benchmark[TilesRow]):
                 inside, border = float(off[kept & ~blended].mean()), float(off[kept & blended].mean())
         assert mesh is not None
         placed = mesh.moved(_back(similarity))
-        above = (placed.vertices[:, 2] > town.height(placed.vertices[:, :2]) - DEPTH)[placed.faces].any(axis=1)
+        above = _above(placed.vertices, town)[placed.faces].any(axis=1)
         seen = dataclasses.replace(placed, faces=placed.faces[above])  # so that an underside takes no samples
         found, _ = sample_points(seen, self.eval_samples, np.random.default_rng(3))
         floor = [*_both_ways(again, truth, town)]
@@ -227,10 +227,14 @@ def _box(town: Town, similarity: Similarity) -> Any:
     return tuple(tuple(corner.tolist()) for corner in similarity.to_unit(np.array([low, high])))
 
 
+def _above(points: NDArray[np.floating], town: Town) -> NDArray[np.bool_]:
+    return points[:, 2] > town.height(points[:, :2]) - DEPTH
+
+
 def _away(points: Float64, town: Town) -> NDArray[np.bool_]:
     """Which points are not at the rim of the town, nor below its ground, where meshes are closed in some way."""
     within = ((points[:, :2] > EDGE) & (points[:, :2] < town.size - EDGE)).all(axis=1)
-    return within & (points[:, 2] > town.height(points[:, :2]) - DEPTH)
+    return within & _above(points, town)
 
 
 def _both_ways(found: Float64, truth: Float64, town: Town) -> tuple[float, float]:

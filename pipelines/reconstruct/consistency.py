@@ -21,6 +21,7 @@ from torch import Tensor
 from ...datasets.views.images import PosedImage
 from ...neural_fields.backend.devices import few_numbers, uniform
 from ...neural_fields.fields.field import FieldLike, as_field
+from ...neural_fields.fields.losses import pseudo_huber
 
 
 @dataclass(frozen=True)
@@ -260,8 +261,8 @@ def flatness_loss(
 ) -> Tensor:
     """How the surface bends where its picture is plain ``(R,)``: √(b² + ε²) − ε of a change of slope b.
 
-    b = (f(x + h t) + f(x − h t) − 2 f(x)) / h with a random tangent t and a random length h at each surface point x. It
-    counts as far as the photograph has one grey value at x, x ± h t / 2 and x ± h t, so not in texture or across edges.
+    b = (f(x + h t) + f(x − h t) − 2 f(x)) / h at each surface point x. Tangent t and length h are random. It counts as
+    far as the photograph has one grey value at x, x ± h t / 2 and x ± h t. In texture and across edges it has not.
     """
     rows, device = len(pixels.view), pixels.view.device
     number, angle = uniform((2, rows), generator, device).to(surface.position)
@@ -283,4 +284,4 @@ def flatness_loss(
         weight = (alike * pictures.weights(view, there.round().long()) * (ahead > 0)).prod(dim=1) * surface.found
     value = as_field(field).value(places[:, :3].reshape(-1, 3), level=level).reshape(rows, 3)
     bend = (value[:, 0] + value[:, 2] - 2 * value[:, 1]) / length
-    return weight * ((bend**2 + options.bend**2).sqrt() - options.bend)
+    return weight * pseudo_huber(bend.square() / (2 * options.bend), options.bend)

@@ -410,7 +410,9 @@ class ReconstructConfig(TrainingSettings):
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)
     depth_weight: float = setting(0.5, "weight of measured depths (depth maps, COLMAP's points); 0: unused", at_least=0)
     consistency: float = setting(
-        0.0, "weight of how patches of neighbouring photographs differ on the surface (1 - NCC); 0: unused", at_least=0
+        0.0,
+        "weight of how photographs differ on the surface (1 - NCC), and its bends where they are plain; 0: none",
+        at_least=0,
     )
     anneal: float = _share(0.2, "share of the training with annealed slopes")
     least_weight: float = setting(1e-4, "samples that contribute less to their pixel get no colour", at_least=0)
