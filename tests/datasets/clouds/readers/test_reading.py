@@ -1,6 +1,7 @@
 """``read_cloud``: every format gives back what was written, and bad files give one line."""
 
 import struct
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -323,6 +324,27 @@ def test_las_headers_that_claim_more_than_the_file_holds(tmp_path, at, form, val
     for read in (read_cloud, open_stream):
         with refused(path, said):
             read(path)
+
+
+def test_laz_with_chunks_of_any_length(tmp_path, monkeypatch):
+    """As in COPC files, where a chunk holds a node of their octree."""
+    laspy, lazrs = pytest.importorskip("laspy"), pytest.importorskip("lazrs")
+    layout = SimpleNamespace(new_for_compression=lambda *form: lazrs.LazVlr.new_for_compression(*form, True))
+    path, points = tmp_path / "cloud.copc.laz", diagonal(4000)
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = points.T
+    with monkeypatch.context() as patch:
+        patch.setattr("laspy._compression.lazrsbackend.lazrs", SimpleNamespace(**vars(lazrs) | {"LazVlr": layout}))
+        with laspy.open(path, "w", header=header, laz_backend=laspy.LazBackend.Lazrs) as writer:
+            for part in np.split(np.arange(4000), (1, 700, 3000)):
+                writer.write_points(las.points[part])
+                writer.point_writer.compressor.finish_current_chunk()
+    with laspy.open(path) as reader:
+        assert lazrs.LazVlr(reader.header.vlrs.get("LasZipVlr")[0].record_data).uses_variable_size_chunks()
+    pieces = np.concatenate([piece.points for piece in open_stream(path).pieces(333)])
+    assert np.array_equal(pieces, points)
+    assert np.array_equal(read_cloud(path).points, points)
 
 
 def test_a_dense_laz_is_no_wrong_claim(tmp_path):

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mplicits.datasets import read_cloud
 from mplicits.datasets.clouds.point_cloud import colors_from, unit_rows
+from mplicits.datasets.clouds.readers.columns import sampled
 from mplicits.datasets.clouds.readers.reading import open_stream
 from mplicits.neural_fields import InputError
 from refusals import refused
@@ -286,3 +287,11 @@ def test_every_dialect_of_a_header_reads_the_same(tmp_path_factory, names, separ
     path = tmp_path_factory.mktemp("dialect") / "a.txt"
     path.write_text((head + "\n" + table(values, sep=separator)).replace("\n", end), newline="")
     check(path, "nc")
+
+
+def test_a_sample_touches_few_pages_of_a_mapped_file():
+    rows = np.arange(1_000_000)
+    found = sampled(rows, 10_000, run=500)
+    assert (len(found), found[0], found[-1]) == (10_000, 0, 999_999)
+    assert np.count_nonzero(np.diff(found) != 1) == 10_000 // 500 - 1
+    assert sampled(rows[:10_000], 10_000).base is rows  # all of them, without a copy
