@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..neural_fields import InputError, Similarity
-
-Float64 = NDArray[np.float64]
+from ..neural_fields.backend.arrays import Float64
 
 UP_AXES: Mapping[str, tuple[float, float, float]] = MappingProxyType({"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)})
 """The names of the axes that may point up, and their directions."""

@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..neural_fields import InputError
+from ..neural_fields.backend.arrays import Float64
 from ..neural_fields.backend.files import write_whole
 from .clouds.readers.tables import numbers
 from .files import decoded, readable
-
-Float64 = NDArray[np.float64]
 
 
 def read_landmarks(path: str | Path) -> tuple[Float64, Float64]:

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
+from ...neural_fields.backend.arrays import Float64, Int64
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
-
-Float64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from ...neural_fields.backend.arrays import Float64, Mask
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
+from ...neural_fields.backend.arrays import Float64
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ..files import DEPTH_SUFFIXES, numeric, read_arrays, read_image, read_rgb, readable, to_bytes
 
-Float64 = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")

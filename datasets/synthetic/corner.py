@@ -7,14 +7,12 @@ from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
+from ...neural_fields.backend.arrays import Float64
 from . import solids
 from .solids import Vector
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

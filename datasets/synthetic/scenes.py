@@ -90,7 +90,7 @@ def render_scene(
     for first in range(0, views, together):
         some = cameras[first : first + together]
         maps = scene_depths(scene, some) if depths else [None] * len(some)
-        for camera, seen, depth in zip(some, _pictures(scene, some, samples, shaded, glossy), maps, strict=True):
+        for camera, seen, depth in zip(some, pictures(scene, some, samples, shaded, glossy), maps, strict=True):
             images.append(PosedImage(f"{len(images):03d}.png", camera, *seen, depth))
         if progress is not None:
             progress(len(images), views)
@@ -131,17 +131,13 @@ def _observations(scene: Scene, points: Float64, cameras: Sequence[Camera]) -> N
     return np.argwhere(free & np.stack([camera.in_view(points)[2] for camera in cameras]))
 
 
-def render_view(
-    scene: Scene, camera: Camera, *, samples: int = 3, shaded: bool = False, glossy: bool = False
-) -> tuple[Float32, Float32]:
-    """One picture of a scene (see `developed`): display RGB ``(H, W, 3)`` and mask ``(H, W)``, both in [0, 1]."""
-    return _pictures(scene, [camera], samples, shaded, glossy)[0]
-
-
-def _pictures(
-    scene: Scene, cameras: Sequence[Camera], samples: int, shaded: bool, glossy: bool
+def pictures(
+    scene: Scene, cameras: Sequence[Camera], samples: int = 3, shaded: bool = False, glossy: bool = False
 ) -> list[tuple[Float32, Float32]]:
-    """`render_view` of several cameras of one size: some rows of all of them at a time."""
+    """Pictures by cameras of one size (see `developed`): display RGB ``(H, W, 3)`` and mask ``(H, W)``, in [0, 1].
+
+    Some rows of all of them are traced at a time.
+    """
     if samples < 1:
         raise ValueError(f"samples={samples}: expected at least one")
     width, height = cameras[0].width, cameras[0].height

@@ -11,8 +11,6 @@ from ...neural_fields import FunctionField, Jet
 from . import solids
 from .solids import Vector
 
-Float64 = NDArray[np.float64]
-
 _STAFF_HEAD: Vector = (0.330, -0.300, 0.68)
 _EYE: Vector = (0.105, -0.225, 0.435)
 

@@ -9,12 +9,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...neural_fields.backend.arrays import Float32, Float64, Int64
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ..files import decode_image, rgb_and_alpha, unit_range
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 Wrap = Literal["repeat", "clamp", "mirror"]
 
 _WRAPS: tuple[Wrap, ...] = ("repeat", "clamp", "mirror")

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError, Similarity
+from ...neural_fields.backend.arrays import Float32
 from ...neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from ..cameras import Camera, Float64, intrinsics
 from ..files import read_rgb, readable, to_bytes, unit_range
@@ -30,7 +31,6 @@ FILES = ("cameras_sphere.npz", "transforms.json", "transforms_train.json")  # lo
 OPAQUE = 0.999  # an opacity of 1 after resampling
 EXACT = 0.01  # pixels that distorting an undistorted point may miss it by
 
-Float32 = NDArray[np.float32]
 N = TypeVar("N", NDArray[np.float32], NDArray[np.float32] | None)
 
 

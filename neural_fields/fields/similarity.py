@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-Float64 = NDArray[np.float64]
+from ..backend.arrays import Float64
 
 
 @dataclass(frozen=True)

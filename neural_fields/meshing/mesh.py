@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.arrays import Float64
 from ..backend.errors import InputError
 from ..backend.files import check_place, whole_file
 from ..fields.similarity import Placement, Similarity
 from .color_space import srgb_to_linear
 from .glb import MATERIAL, Motion, write_glb
 
-Float64 = NDArray[np.float64]
 Origin = tuple[float, float, float]
 
 FLOAT32_REACH = 128.0  # scales from the origin, up to which float32 rounds by less than a hundredth cell at 2048³

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,24 @@ from .mesh import Mesh
 Place = tuple[int, int, int]
 
 
+class Border(NamedTuple):
+    """What neighbours need of a part: what is known on the sides of its cube.
+
+    Attributes:
+        points: ``(P, 3)`` lattice points at which the field was evaluated.
+        values: ``(P,)`` of the field there.
+        edges: ``(S,)`` numbers of the lattice edges that the surface crosses.
+        vertices: ``(S, 3)`` of the surface there.
+        normals: ``(S, 3)``.
+    """
+
+    points: Ints
+    values: Floats
+    edges: Ints
+    vertices: NDArray[np.float64]
+    normals: Floats
+
+
 class Part(NamedTuple):
     """The surface in one cube of a lattice.
 
@@ -24,35 +42,13 @@ class Part(NamedTuple):
         place: ``(3,)`` number of the cube along each axis, from the lowest corner.
         mesh: its vertices on sides of the cube are repeated by its neighbours there, equal to the last bit.
         shared: ``(S,)`` rows of these vertices.
-        edges: ``(S,)`` numbers of their lattice edges, by which the neighbours know them.
+        border: has their lattice edges, by which the neighbours know them.
     """
 
     place: Place
     mesh: Mesh
     shared: NDArray[np.intp]
-    edges: NDArray[np.int64]
-
-
-class _Border(NamedTuple):
-    """What a part knows of its sides: lattice points and values; crossed edges, their vertices and normals."""
-
-    points: Ints
-    values: Floats
-    edges: Ints
-    vertices: NDArray[np.float64]
-    normals: NDArray[np.floating]
-
-    @classmethod
-    def joined(cls, borders: list[_Border]) -> _Border:
-        """What all of them know."""
-        rows = np.empty((0, 3), np.float32)
-        return cls(
-            np.concatenate([rows.astype(np.int64), *(border.points for border in borders)]),
-            np.concatenate([rows[:, 0], *(border.values for border in borders)]),
-            np.concatenate([rows[:, 0].astype(np.int64), *(border.edges for border in borders)]),
-            np.concatenate([rows.astype(np.float64), *(border.vertices for border in borders)]),
-            np.concatenate([rows, *(border.normals for border in borders)]),
-        )
+    border: Border
 
 
 def extract_parts(
@@ -65,6 +61,7 @@ def extract_parts(
     lipschitz: float = 1.25,
     clearance: float = 1e-3,
     batch: int = 1 << 18,
+    known: Mapping[Place, Border] | None = None,
     progress: Progress | None = None,
 ) -> Iterator[Part]:
     """The surface that `extract_mesh` extracts, in cubes of ``cells`` cells, one after the other.
@@ -83,6 +80,7 @@ def extract_parts(
         lipschitz: L, as for `extract_mesh`.
         clearance: least distance of a vertex from the ends of its edge, in cells.
         batch: points per call of the field.
+        known: of the parts of an extraction with the same arguments that was interrupted; the others come.
         progress: called with ``("parts", done, total)`` after every part.
 
     Raises:
@@ -104,33 +102,44 @@ def extract_parts(
     lattice = Lattice.over(bounds, resolution)
     size = np.array(lattice.shape) + 1
     blocks, _, kept = cull_blocks(Sampler(field, lattice, batch), level=level, lipschitz=slope, smallest=cells)
-    waiting = dict.fromkeys(map(tuple, np.unique(blocks[kept] // cells, axis=0).tolist()))
-    borders: dict[Place, _Border] = {}
-    done = 0
-    while waiting:
-        place: Place = next(iter(waiting))
-        del waiting[place]
-        part = lattice.part(np.array(place) * cells, cells)
+    borders = dict(known or {})
+
+    def around(place: Place) -> list[Place]:
+        """The cubes beside one."""
         beside = np.array(place) + OFFSETS - 1
         exists = ((beside >= 0) & (beside * cells < lattice.shape)).all(axis=1)
-        around = [tuple(each) for each in beside[exists].tolist()]
-        known = [borders[each] for each in around if each in borders]
+        return [tuple(each) for each in beside[exists].tolist()]
+
+    def lacking(place: Place) -> Iterator[Place]:
+        """The cubes beside a part that do not know all the edges which the surface crosses there."""
+        mine = borders[place].edges
+        starts, ends = _ends(mine, size)
+        for other in around(place):
+            box = lattice.part(np.array(other) * cells, cells)
+            theirs = borders[other].edges if other in borders else ()
+            if len(np.setdiff1d(mine[_inside(starts, box) & _inside(ends, box)], theirs)):
+                yield other
+
+    every = map(tuple, np.unique(blocks[kept] // cells, axis=0).tolist())
+    waiting: dict[Place, None] = dict.fromkeys(place for place in every if place not in borders)
+    for place in borders:
+        waiting |= dict.fromkeys(lacking(place))
+    done = len(borders)
+    while waiting:
+        place = next(iter(waiting))
+        del waiting[place]
+        part = lattice.part(np.array(place) * cells, cells)
+        beside = [borders[each] for each in around(place) if each in borders]
         try:
-            found, border = _part(Sampler(field, part, batch), size, place, known, level, slope, clearance=clearance)
+            found = _part(Sampler(field, part, batch), size, place, beside, level, slope, clearance=clearance)
         except NoSurfaceError:
             continue
         finally:
             done += 1
             if progress is not None:
                 progress("parts", done, done + len(waiting))
-        borders[place] = border
-        starts, ends = _ends(border.edges, size)
-        for other in around:
-            box = lattice.part(np.array(other) * cells, cells)
-            mine = border.edges[_inside(starts, box) & _inside(ends, box)]
-            theirs = borders[other].edges if other in borders else ()
-            if len(np.setdiff1d(mine, theirs)):
-                waiting[other] = None
+        borders[place] = found.border
+        waiting |= dict.fromkeys(lacking(place))
         yield found
     if not borders:
         raise NoSurfaceError(f"no surface in any of {done} parts of the box {lattice}")
@@ -153,19 +162,21 @@ def _part(
     sampler: Sampler,
     size: NDArray[np.int64],
     place: Place,
-    known: list[_Border],
+    known: list[Border],
     level: int,
     slope: float,
     *,
     clearance: float,
-) -> tuple[Part, _Border]:
-    """A part that takes what is ``known`` of its border, and all that is known of that then.
+) -> Part:
+    """A part that takes what is ``known`` of its border.
 
     ``size`` ``(3,)`` counts the points of the whole lattice.
     """
     lattice = sampler.lattice
     first, shape = np.array(lattice.first), np.array(lattice.shape)
-    points, values, edges, places, directions = _Border.joined(known)
+    rows = np.empty((0, 3))
+    nothing = Border(rows.astype(np.int64), rows[:, 0], rows[:, 0].astype(np.int64), rows, rows.astype(np.float32))
+    points, values, edges, places, directions = map(np.concatenate, zip(nothing, *known, strict=True))
     within = _inside(points, lattice)
     edges, chosen = np.unique(edges, return_index=True)
     starts, stops = _ends(edges, size)
@@ -182,5 +193,5 @@ def _part(
     assert mesh.normals is not None
     mesh.vertices[shared[mine]], mesh.normals[shared[mine]] = places[chosen[theirs]], directions[chosen[theirs]]
     on_sides, asked = active.on_sides
-    border = _Border(on_sides + first, asked, own, mesh.vertices[shared], mesh.normals[shared])
-    return Part(place, mesh, shared, own), border
+    border = Border(on_sides + first, asked, own, mesh.vertices[shared], mesh.normals[shared])
+    return Part(place, mesh, shared, border)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ..training.settings import given_flags
-from .common import Command, add_flags, positive, refuse, whole, write_json
+from .common import Command, add_flags, positive, refuse, stoppable, whole, write_json
 
 if TYPE_CHECKING:
     from ..mesh.solids import Made
@@ -83,7 +83,8 @@ def _scene(arguments: argparse.Namespace, started: float) -> int:
     others |= {"crs", "format"} if arguments.in_parts else set()
     refuse(arguments, sorted(others), f"does not go with {flag}; leave it out")
     about = (arguments.run, arguments.out, SceneOptions(**given_flags(arguments, SceneOptions)))
-    with progress_bars(counting=True) as report:
+    kept = "the same command goes on from the parts that it has"
+    with stoppable(kept, at_any_time=True), progress_bars(counting=True) as report:
         if arguments.in_parts:
             vertices, faces = ply_of_run(*about, say=print, report=report)
             made: dict[str, Any] = {"vertices": vertices, "faces": faces}

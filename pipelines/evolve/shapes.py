@@ -12,7 +12,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.landmarks import read_landmarks
@@ -30,12 +29,11 @@ from ...neural_fields import (
     load_field,
     project_to_surface,
 )
+from ...neural_fields.backend.arrays import Float64
 from ...neural_fields.fields.csg import Bounded
 from ...neural_fields.meshing.extract import surface_needed
 from ..surface.surface import sample_points
 from ..training.folder import find_field
-
-Float64 = NDArray[np.float64]
 
 _SIZES: Mapping[str, int] = MappingProxyType({"sphere": 1, "torus": 2, "box": 3, "capsule": 2})
 _EXACT: Mapping[str, Callable[..., Field]] = MappingProxyType(

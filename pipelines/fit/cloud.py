@@ -24,10 +24,9 @@ from ...datasets.clouds.readers.columns import CloudStream, MemoryStream
 from ...datasets.clouds.readers.reading import check_cloud, open_stream
 from ...datasets.clouds.tiling import TilePlan
 from ...neural_fields import Similarity
+from ...neural_fields.backend.arrays import Float32
 from ...neural_fields.backend.files import whole_file
 from ..training.folder import MERGED_FILE
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,8 @@ from torch import Tensor
 
 from ...datasets.clouds.cleaning.winding import DipoleField
 from ...datasets.clouds.point_cloud import unit_rows
+from ...neural_fields.backend.arrays import Float64, Int64, Mask
 from .cloud import CLOUD, CloudDistance
-
-Float64 = NDArray[np.float64]
-Rows = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -154,7 +151,7 @@ class _Patches:
         for start in range(0, len(points), self.options.block):
             self._fit(np.arange(start, min(start + self.options.block, len(points))))
 
-    def _fit(self, rows: Rows) -> None:
+    def _fit(self, rows: Int64) -> None:
         distance, found = self._nearest(self.points[rows], self.options.neighbors + 1)
         distance, found = distance[:, 1:], found[:, 1:]  # not the point itself
         own, theirs = self.normals[rows][:, None], self.normals[found]
@@ -180,11 +177,11 @@ class _Patches:
         self.shape[rows] = 0.5 * (solved + solved.transpose(0, 2, 1)) / scale[..., None]
         self.reach[rows] = distance[:, 5]
 
-    def _nearest(self, x: Float64, count: int) -> tuple[Float64, Rows]:
+    def _nearest(self, x: Float64, count: int) -> tuple[Float64, Int64]:
         distance, found = self.tree.query(x, count, workers=-1)
         return np.asarray(distance, np.float64), np.asarray(found, np.int64)
 
-    def at(self, x: Float64, count: int) -> tuple[Float64, Rows, Float64, Float64, Float64]:
+    def at(self, x: Float64, count: int) -> tuple[Float64, Int64, Float64, Float64, Float64]:
         """The patches of the nearest points at ``(m, 3)`` places.
 
         Distances and rows of the points ``(m, k)``, vectors from them ``(m, k, 3)``, values ``(m, k)`` and unit normals
@@ -233,7 +230,7 @@ def _repaired(patches: _Patches) -> tuple[Float64, int]:
     return fixed, int(torn.sum())
 
 
-def _placed(patches: _Patches, parents: Rows, random: np.random.Generator) -> tuple[Float64, Float64]:
+def _placed(patches: _Patches, parents: Int64, random: np.random.Generator) -> tuple[Float64, Float64]:
     """New points and their normals, at most one beside each of ``parents``."""
     normal = patches.normals[parents]
     step = random.normal(size=(len(parents), 3))

@@ -15,11 +15,8 @@ from torch import Tensor
 
 from ...datasets.clouds.cleaning.outliers import agreement, unsupported
 from ...neural_fields import Field
+from ...neural_fields.backend.arrays import Float64, Int64, Mask
 from .samples import value_and_gradient
-
-Float64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -127,7 +124,7 @@ def _patches(points: Float64, normals: Float64, against: Mask, options: ReviewOp
     return turned
 
 
-def _joined(rows: Rows, near: Rows, linked: Mask, count: int) -> NDArray[np.intp]:
+def _joined(rows: Int64, near: Int64, linked: Mask, count: int) -> NDArray[np.intp]:
     """The patch ``(m,)`` of each of ``rows``: components of the graph of ``linked`` neighbours ``near`` ``(m, k)``."""
     start, end = np.repeat(rows, near.shape[1])[linked.ravel()], near[linked]
     graph = coo_array((np.ones(len(start), np.int8), (start, end)), shape=(count, count))

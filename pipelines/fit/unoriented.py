@@ -17,14 +17,13 @@ from ...datasets.clouds.cleaning.orientation import OUTER_REGION, Exterior, solv
 from ...datasets.clouds.cleaning.winding import WINDING
 from ...datasets.clouds.point_cloud import spread
 from ...neural_fields import Siren
+from ...neural_fields.backend.arrays import Float32
 from ...neural_fields.backend.devices import upload
 from ..training.settings import FitConfig
 from ..training.trainer import Group, Objective, Report, StopFlag, Trainer, warm_cosine
 from .cloud import CloudDistance
 from .level import new_level
 from .samples import SAMPLING, spread_points, value_and_gradient
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import vertex_normals
 from ...neural_fields import InputError, Mesh
+from ...neural_fields.backend.arrays import Float64, Int64
 from ..surface.distance import MeshDistance
 from ..surface.surface import is_closed
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 
 def check_tools(flag: str, *modules: str) -> None:

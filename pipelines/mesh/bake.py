@@ -12,14 +12,13 @@ from scipy.ndimage import distance_transform_edt
 
 from ...datasets.clouds.point_cloud import unit_rows
 from ...neural_fields import InputError, Similarity
+from ...neural_fields.backend.arrays import Float64, Image
 from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing.extract import Mesh
 from ..surface.raster import cover
 from .atlas import decimate, to_frame, unwrap
 from .files import write_textured
 
-Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Attribute = Callable[[Float64], NDArray[np.floating]]
 
 

@@ -6,12 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...neural_fields import InputError
+from ...neural_fields.backend.arrays import Float64
 from ...neural_fields.fields.similarity import Placement
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

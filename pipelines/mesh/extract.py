@@ -74,44 +74,54 @@ def fineness(field: Field, points: NDArray[np.floating], *, level: int = -1) -> 
 
 
 @dataclass(frozen=True)
-class MeshOptions:
-    """How to mesh a run.
+class SurfaceOptions:
+    """What of a run becomes a surface.
 
     Attributes:
         resolution: cells along each side of the cube around the unit sphere; None is 256, or up to 1024 where a run has
             parts too thin for that (see `fineness`).
         time: the moment, for a surface that moves.
         level: counted from 0, the coarsest; None is the finest.
-        normal_level: level of the normals (neural normal mapping); None is ``level``.
         colors: whether vertices get the colours of the run's texture, if it has one.
-        texture: bake colours and the finest normals into images; texels along each side (.glb or .obj).
-        texture_faces: triangles to keep of a mesh that is unwrapped.
-        faces: triangles to keep of one that is not; None keeps all.
-        report: whether to look at the mesh as a printer would; None does so for STL.
         keep_unsupported: whether to keep components that no input points support.
-        seen: whether to leave out what is visible in fewer than two photographs, for a run of ``reconstruct``.
-        keep_largest: whether to keep only the component of largest area.
-        trim_distance: drop faces further than this from the points, in input units.
-        cloud: the points for that; by default the file that was fitted.
-        up: the axis that points up in the input, "y" or "z"; see `Placement`, as for ``unit`` ("mm") and ``center``.
+        up: the axis that points up in the input, "y" or "z"; see `Placement`, as for ``unit`` ("mm").
     """
 
     resolution: int | None = None
     time: float | None = None
     level: int | None = None
-    normal_level: int | None = None
     colors: bool = True
+    keep_unsupported: bool = False
+    up: str | None = None
+    unit: str | None = None
+
+
+@dataclass(frozen=True)
+class MeshOptions(SurfaceOptions):
+    """How to mesh a run.
+
+    Attributes:
+        normal_level: level of the normals (neural normal mapping); None is ``level``.
+        texture: bake colours and the finest normals into images; texels along each side (.glb or .obj).
+        texture_faces: triangles to keep of a mesh that is unwrapped.
+        faces: triangles to keep of one that is not; None keeps all.
+        report: whether to look at the mesh as a printer would; None does so for STL.
+        seen: whether to leave out what is visible in fewer than two photographs, for a run of ``reconstruct``.
+        keep_largest: whether to keep only the component of largest area.
+        trim_distance: drop faces further than this from the points, in input units.
+        cloud: the points for that; by default the file that was fitted.
+        center: whether the middle of the mesh goes to the origin; see `Placement`.
+    """
+
+    normal_level: int | None = None
     texture: int | None = None
     texture_faces: int = 50_000
     faces: int | None = None
     report: bool | None = None
-    keep_unsupported: bool = False
     seen: bool = False
     keep_largest: bool = False
     trim_distance: float | None = None
     cloud: str | Path | None = None
-    up: str | None = None
-    unit: str | None = None
     center: bool = False
 
 

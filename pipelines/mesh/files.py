@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError, Mesh, Similarity
+from ...neural_fields.backend.arrays import Image
 from ...neural_fields.backend.files import whole_file
 from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing.glb import MATERIAL, Motion
@@ -24,8 +25,6 @@ from ...neural_fields.meshing.mesh import (
     write_triangles,
 )
 from .atlas import check_tools
-
-Image = NDArray[np.uint8]
 
 
 def placement_of(up: str | None, unit: str | None, center: bool) -> Placement:

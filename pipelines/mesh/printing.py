@@ -8,13 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 
 from ...neural_fields import Field, Mesh, Similarity, project_to_surface, sphere_trace
+from ...neural_fields.backend.arrays import Float64
 from ...neural_fields.fields.similarity import FRAMES, Placement
 from ..surface.surface import components, sample_points
-
-Float64 = NDArray[np.float64]
 
 
 class Thickness(NamedTuple):

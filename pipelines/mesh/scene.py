@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import shutil
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,61 +20,46 @@ from scipy.spatial import KDTree
 from ...datasets import spacing_of
 from ...datasets.clouds.point_cloud import unit_rows
 from ...neural_fields import Field, InputError, Mesh, Similarity
-from ...neural_fields.backend.files import check_place, partial_of, remove, rename, whole_file, write_json
+from ...neural_fields.backend.files import check_place, files_in, json_bytes, remove, rename, whole_file, write_json
 from ...neural_fields.fields.similarity import Placement
 from ...neural_fields.meshing._cells import CORNERS, Bounds
 from ...neural_fields.meshing.extract import DEFAULT_BOUNDS, NoSurfaceError, surface_needed
 from ...neural_fields.meshing.mesh import check_mesh_path, ply_faces, ply_header, ply_vertices
-from ...neural_fields.meshing.parts import Place, extract_parts
+from ...neural_fields.meshing.parts import Border, Place, extract_parts
+from ..fit.cloud import file_facts
 from ..surface.surface import (
     Footing,
     Support,
     component_of_vertices,
     footing,
+    in_sphere,
     joined,
     keep_faces,
     read_support,
-    within_sphere,
 )
 from ..texture.transport import Colors, colors_of_run
-from ..training.folder import chosen_level, find_field, load_still
+from ..training.folder import chosen_level, find_field, load_still, locked
 from ..training.progress import Report, counted, silent
 from .atlas import deviation
 from .earth import Float64, Stand, on_globe, upright
-from .extract import chosen_resolution, evaluated
+from .extract import SurfaceOptions, chosen_resolution, evaluated
 from .files import placement_of
 
 SCENE_FILE = "tileset.json"
 SEEN = 10_000  # points of each mesh at which errors are measured: of the Armadillo, 50,000 find the same
 TILES = "tiles"  # folder of the GLB files
 PARTS = "parts"  # folder of the meshes, while a scene is written
-NOTHING = np.empty(0, np.int64)  # shared with other parts
 
 
 @dataclass(frozen=True)
-class SceneOptions:
-    """How a run becomes 3D Tiles.
+class SceneOptions(SurfaceOptions):
+    """How a run becomes 3D Tiles; ``level`` is that of the finest tiles, those of twice the size have the one before.
 
     Attributes:
-        resolution: cells along the side of the cube around the unit sphere, at the finest; None as in `MeshOptions`.
-        time: the moment, for a surface that moves.
-        level: of the finest tiles, counted from 0, the coarsest; None is the finest. Tiles of twice the size have the
-            level before.
-        colors: whether vertices get the colours of the run's texture, if it has one.
-        keep_unsupported: whether to keep components that no input points support.
-        up: the axis that points up in the input, "y" or "z"; see `Placement`, as for ``unit``.
-        unit: length of one input unit.
         crs: coordinate reference system of the input, as pyproj takes it; None is that of the cloud's file, if any.
         cells: cells along each edge of a tile, a power of two.
     """
 
-    resolution: int | None = None
-    time: float | None = None
-    level: int | None = None
-    colors: bool = True
-    keep_unsupported: bool = False
-    up: str | None = None
-    unit: str | None = None
     crs: str | None = None
     cells: int = 128
 
@@ -100,7 +85,7 @@ def scene_of_run(
 
     Tiles are cubes of a lattice, `extract_parts`; each has up to eight of half the size that replace it. The geometric
     error of a tile is its largest distance to those, both ways, plus theirs. Tiles of one size meet without gaps.
-    Memory is that of nine tiles, and of the support.
+    Memory is that of nine tiles, and of the support. The same call after an interruption goes on, see `_workplace`.
 
     Raises:
         InputError: there is no such run or level, it has no surface, the folder holds something else, or the coordinate
@@ -115,12 +100,12 @@ def scene_of_run(
     source = _Source.of(run, options, say)
     stand = _stand(options, placement, source.similarity, source.record, source.file)
     say(f"coordinates: {stand.line}")
-    partial = partial_of(out)
-    try:
+    with _workplace(out, source, options) as folder:
         for step in range(source.steps):
-            source.extract(partial / PARTS / str(step), options, step=step, report=report)
-        show, total = counted(report or silent, "writing tiles"), sum(1 for _ in (partial / PARTS).rglob("*.npz"))
-        writer = _Writer(partial, stand, source.similarity, source.colors, show, total)
+            source.extract(folder / PARTS / str(step), options, step=step, report=report)
+        shutil.rmtree(folder / TILES, ignore_errors=True)  # of a scene that was not finished
+        show, total = counted(report or silent, "writing tiles"), sum(1 for _ in (folder / PARTS).rglob("*.npz"))
+        writer = _Writer(folder, stand, source.similarity, source.colors, show, total)
         root = writer.tile(source.steps - 1, (0, 0, 0))
         if root is None:
             raise InputError(f"{source.file}: no surface in the region of interest; train it longer (--steps)")
@@ -132,10 +117,8 @@ def scene_of_run(
         out.mkdir(parents=True, exist_ok=True)
         remove(out / SCENE_FILE)  # of an older scene
         shutil.rmtree(out / TILES, ignore_errors=True)
-        rename(partial / TILES, out / TILES)
+        rename(folder / TILES, out / TILES)
         write_json(out / SCENE_FILE, scene)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return Scene(writer.tiles, source.steps, writer.faces, root["geometricError"])
 
 
@@ -149,8 +132,8 @@ def ply_of_run(
 ) -> tuple[int, int]:
     """Write the surface of a run as one PLY in input coordinates, cube by cube → the numbers of vertices and faces.
 
-    Cubes share the vertices on their sides. Memory is that of a cube, of those vertices, and of the support. Raises an
-    InputError, as `export_run` does.
+    Cubes share the vertices on their sides. Memory is that of a cube, of those vertices, and of the support. The same
+    call after an interruption goes on, see `_workplace`. Raises an InputError, as `export_run` does.
     """
     options, out, say = options or SceneOptions(), Path(out), say or (lambda _: None)
     placement = placement_of(options.up, options.unit, False)
@@ -161,11 +144,10 @@ def ply_of_run(
         raise InputError(f"--in-parts: {source.file} is cut to a region, which takes the whole mesh; leave it out")
     if (line := placement.describe(".ply")) is not None:
         say(f"coordinates: {line}")
-    folder = partial_of(out).with_suffix(".parts")
-    try:
-        source.extract(folder, options, report=report)
-        paths = sorted(folder.iterdir())
-        total, faces, sides = 0, 0, [NOTHING]
+    with _workplace(out, source, options) as folder:
+        source.extract(folder / PARTS, options, report=report)
+        paths = _files(folder / PARTS)
+        total, faces, sides = 0, 0, [np.empty(0, np.int64)]
         for mesh, _, edges in map(_kept, paths):
             total, faces = total + len(mesh.vertices), faces + len(mesh.faces)
             sides.append(edges)
@@ -200,8 +182,6 @@ def ply_of_run(
                 faces_at += file.write(ply_faces(row[mesh.faces]).data)
                 written += len(vertices)
                 show(k + 1, len(paths))
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
     return total, faces
 
 
@@ -236,8 +216,11 @@ class _Source(NamedTuple):
         return cls(file, field, similarity, record, level, support, colors, *lattice)
 
     def extract(self, folder: Path, options: SceneOptions, *, step: int = 0, report: Report | None = None) -> None:
-        """Keep the cubes of a step in a new ``folder``; each step after the first has the level before, down to 0."""
-        folder.mkdir(parents=True)
+        """Keep the cubes of a step in a ``folder``; each step after the first has the level before, down to 0.
+
+        Those that an interrupted command has left there stay.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
         size = self.resolution // 2**step
         show = counted(report or silent, f"tiles of {size} cells per side")
         # Coarse cells may miss all of a thin surface.
@@ -248,14 +231,38 @@ class _Source(NamedTuple):
                 cells=options.cells,
                 level=max(0, self.level - step),
                 bounds=self.bounds,
+                known=dict(map(_border, _files(folder))),
                 progress=lambda _, done, total: show(done, total),
             ):
-                if "region" not in self.record:
-                    _keep(folder, part.place, part.mesh, part.shared, part.edges)
-                elif (inside := within_sphere(part.mesh)) is not None:
-                    _keep(folder, part.place, inside, NOTHING, NOTHING)
+                arrays = {name: getattr(part.mesh, name) for name in ("vertices", "faces", "normals")}
+                arrays |= {"shared": part.shared} | {f"border_{name}": x for name, x in part.border._asdict().items()}
+                with whole_file(folder / f"{_name(part.place)}.npz") as partial:
+                    np.savez(partial, allow_pickle=False, **arrays)
+        if "region" in self.record:
+            for path in _files(folder):
+                _cut(path, in_sphere(_kept(path, whole=True)[0]))
         if self.support is not None and not self.support.visible and not options.keep_unsupported:
             _drop_unsupported(folder, self.support)
+
+
+@contextmanager
+def _workplace(out: Path, source: _Source, options: SceneOptions) -> Iterator[Path]:
+    """A hidden folder beside ``out`` for what it is made of, which an interruption leaves for the same command."""
+    folder = out.with_name(f".{out.name}.{PARTS}")
+    about = {**file_facts(source.file), "options": dataclasses.asdict(options), "bounds": source.bounds}
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        known = folder / "about.json"
+        if not known.is_file() or known.read_bytes() != json_bytes(about):
+            shutil.rmtree(folder / PARTS, ignore_errors=True)
+            write_json(known, about)
+        try:
+            yield folder
+        except InputError as error:
+            if not isinstance(error.__cause__, OSError):  # as of a full disk
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _stand(
@@ -287,33 +294,54 @@ def _lattice(support: Support | None, resolution: int, cells: int) -> tuple[Boun
     return ((x, y, z), (i, j, k)), int(along.max()), steps
 
 
-def _path(folder: Path, place: Place) -> Path:
-    return folder / f"{'_'.join(map(str, place))}.npz"
+def _name(place: Place) -> str:
+    return "_".join(map(str, place))
 
 
-def _keep(folder: Path, place: Place, mesh: Mesh, shared: NDArray[Any], edges: NDArray[Any]) -> None:
-    assert mesh.normals is not None
-    arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "shared": shared, "edges": edges}
-    np.savez(_path(folder, place), allow_pickle=False, **arrays)
+def _files(folder: Path) -> list[Path]:
+    """The files of the cubes in a folder, in the order of their places."""
+    return files_in(folder, (".npz",))
 
 
-def _kept(path: Path) -> tuple[Mesh, NDArray[Any], NDArray[Any]]:
-    """The mesh of a file, and of its vertices that are shared with others the rows and the lattice edges."""
+def _border(path: Path) -> tuple[Place, Border]:
+    """The place of a cube, and what its neighbours need of it."""
+    x, y, z = map(int, path.stem.split("_"))
+    with np.load(path) as stored:
+        return (x, y, z), Border(*(stored[f"border_{name}"] for name in Border._fields))
+
+
+def _cut(path: Path, kept: NDArray[np.bool_]) -> None:
+    """Have `_kept` return these faces ``(F,)`` of a cube; its file stays whole, for an extraction that goes on."""
+    with whole_file(path.with_suffix(".npy")) as partial:
+        np.save(partial, kept)
+
+
+def _kept(path: Path, *, whole: bool = False) -> tuple[Mesh, NDArray[Any], NDArray[Any]]:
+    """The mesh of a cube, and of its vertices that are shared with others the rows and the lattice edges.
+
+    What `_cut` leaves out is there if it is wanted ``whole``.
+    """
     with np.load(path) as stored:
         mesh = Mesh(stored["vertices"], stored["faces"], stored["normals"])
-        return mesh, stored["shared"], stored["edges"]
+        shared, edges = stored["shared"], stored["border_edges"]
+    if whole or not (cut := path.with_suffix(".npy")).is_file():
+        return mesh, shared, edges
+    kept = np.load(cut)
+    used = np.unique(mesh.faces[kept])
+    stay = np.isin(shared, used)
+    return keep_faces(mesh, kept), np.searchsorted(used, shared[stay]), edges[stay]
 
 
 def _drop_unsupported(folder: Path, support: Support) -> None:
     """Drop the components, followed from part to part, that no points support; see `drop_unsupported`."""
-    paths = sorted(folder.iterdir())
+    paths = _files(folder)
     if not paths:
         return
     tree, total = KDTree(support.points), 0
     numbers: list[NDArray[np.intp]] = []
     edges, owners, found = [], [], []
     for path in paths:
-        mesh, shared, lattice_edges = _kept(path)
+        mesh, shared, lattice_edges = _kept(path, whole=True)
         component = component_of_vertices(mesh)
         edges.append(lattice_edges)
         owners.append(component[shared] + total)
@@ -333,16 +361,7 @@ def _drop_unsupported(folder: Path, support: Support) -> None:
     if not stands.any():
         return
     for path, number in zip(paths, numbers, strict=True):
-        kept = stands[whole[number]]
-        if not kept.any():
-            path.unlink()
-        elif not kept.all():
-            x, y, z = map(int, path.stem.split("_"))
-            mesh, shared, lattice_edges = _kept(path)
-            used = np.unique(mesh.faces[kept])
-            stay = np.isin(shared, used)
-            shared, lattice_edges = np.searchsorted(used, shared[stay]), lattice_edges[stay]
-            _keep(folder, (x, y, z), keep_faces(mesh, kept), shared, lattice_edges)
+        _cut(path, stands[whole[number]])
 
 
 def _corners(entry: Mapping[str, Any]) -> tuple[Float64, Float64]:
@@ -368,8 +387,7 @@ class _Writer:
         """The entry of a tile in the tree, with those below it; None where there is nothing."""
         below: list[Place] = [tuple(each) for each in (2 * np.array(place) + CORNERS).tolist()] if step else []
         children = [tile for each in below if (tile := self.tile(step - 1, each)) is not None]
-        path = _path(self.out / PARTS / str(step), place)
-        mesh = _kept(path)[0] if path.is_file() else None
+        mesh = self._mesh(step, place)
         if mesh is None and not children:
             return None
         boxes = [_corners(child) for child in children]
@@ -383,8 +401,7 @@ class _Writer:
         volume = {"boundingVolume": {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]}}
         error = 0.0
         if step:
-            files = [_path(self.out / PARTS / str(step - 1), each) for each in below]
-            finer = [_kept(file)[0] for file in files if file.is_file()]
+            finer = [each for each in (self._mesh(step - 1, under) for under in below) if each is not None]
             apart = float(np.linalg.norm(high - low))  # if only one of the two has a surface
             if mesh is not None and finer:
                 apart = deviation(joined(finer), mesh, probes=SEEN)[0] * self.similarity.scale * self.stand.metres
@@ -392,6 +409,12 @@ class _Writer:
             # A surface at the side of a cube may be in its neighbour at the next step: nothing is there in its place.
             entry["children"] = children or [volume | {"geometricError": 0.0}]
         return volume | {"geometricError": error} | entry
+
+    def _mesh(self, step: int, place: Place) -> Mesh | None:
+        """The surface in a cube; None where there is none."""
+        path = self.out / PARTS / str(step) / f"{_name(place)}.npz"
+        mesh = _kept(path)[0] if path.is_file() else None
+        return mesh if mesh is not None and len(mesh.faces) else None
 
     def _placed(self, mesh: Mesh) -> Mesh:
         assert mesh.normals is not None
@@ -401,7 +424,7 @@ class _Writer:
         return dataclasses.replace(mesh, vertices=vertices, normals=normals, colors=colors)
 
     def _write(self, step: int, place: Place, mesh: Mesh) -> str:
-        name = f"{TILES}/{step}/{'_'.join(map(str, place))}.glb"
+        name = f"{TILES}/{step}/{_name(place)}.glb"
         mesh.export(self.out / name, up="z", unit="m")
         self.tiles += 1
         self.faces += len(mesh.faces) if step == 0 else 0

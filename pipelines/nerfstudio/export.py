@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...datasets.cameras import Camera, intrinsics
 from ...neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError, Similarity
+from ...neural_fields.backend.arrays import Float64
 from ...neural_fields.meshing.mesh import check_mesh_path
 from ..mesh.bake import check_texture_size, textured_mesh
 from ..mesh.extract import normals_near
@@ -22,7 +23,6 @@ from ..mesh.files import check_textured_path
 from ..reconstruct.views import visible_points
 from ..surface.surface import Support, visible_part
 
-Float64 = NDArray[np.float64]
 Move = tuple[Float64, float]  # (3, 4) and a scale: see `in_data_coordinates`
 
 

@@ -21,14 +21,13 @@ from ...datasets.views.formats.shots import DepthMap, DepthSource
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...datasets.views.poses.colmap_process import Report as ColmapReport
 from ...neural_fields import InputError, Similarity
+from ...neural_fields.backend.arrays import Float64
 from ..mesh.files import write_mesh
 from ..training.progress import Report, counted, silent
 from .frustums import camera_mesh
 from .hull import Agreement, named
 from .measured import UNITS, said_outside
 from .model import meets_sphere
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImages
+from ...neural_fields.backend.arrays import Float64
 from ...neural_fields.meshing.extract import Mesh
 from ..render.shade import COLOR_MAPS, apply_color_map
 from ..surface.surface import joined
 
-Float64 = NDArray[np.float64]
 Rgb = tuple[float, float, float]
 
 

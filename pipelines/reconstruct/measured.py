@@ -16,12 +16,10 @@ from ...datasets.cameras import Camera
 from ...datasets.views.formats.shots import DepthMap
 from ...datasets.views.images import OBJECT, PosedImage, PosedImages
 from ...neural_fields import Field, InputError, sphere_trace
+from ...neural_fields.backend.arrays import Float64, Int64
 from ...neural_fields.backend.devices import graph_input, uniform
 from ...neural_fields.fields.field import FieldLike
 from ...neural_fields.volume.weights import sphere_span
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 UNITS = "give --depth-scale (numbers per unit of the cameras), or --depth-kind relative"  # if they are others
 AS_IT_IS, RELATIVE, DISPARITY = 0, 1, 2  # how a number becomes a depth

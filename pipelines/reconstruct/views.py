@@ -16,13 +16,12 @@ from ...datasets.cameras import Camera
 from ...datasets.files import unit_range
 from ...datasets.views.images import OBJECT, PosedImage, resample, shrink
 from ...neural_fields import Field, Mesh, sphere_trace
+from ...neural_fields.backend.arrays import Float32
 from ...neural_fields.volume.render import Sampling
 from ..render.picture import Image, stacked
 from ..render.rasterise import mesh_view
 from ..render.studio import sees
 from .model import SceneModel, meets_sphere
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

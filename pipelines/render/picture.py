@@ -8,12 +8,11 @@ from pathlib import Path
 import cv2
 import imageio.v3 as iio
 import numpy as np
-from numpy.typing import NDArray
 
 from ...neural_fields import InputError
+from ...neural_fields.backend.arrays import Image
 from ...neural_fields.backend.files import check_place, write_whole
 
-Image = NDArray[np.uint8]
 Color = tuple[float, float, float]
 Titled = tuple[str, Image]
 

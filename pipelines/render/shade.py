@@ -12,18 +12,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from ...datasets.cameras import Camera
 from ...neural_fields import Field
+from ...neural_fields.backend.arrays import Float32
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, ball_crossing
 from ..training.settings import SHADINGS, ShadeOptions
 from .picture import Color, Image
 from .trace import Seen
-
-Float32 = NDArray[np.float32]
 
 # u below which a ray is given up as dark: v is 0.001 there, and steps only get smaller.
 DARK = 0.02

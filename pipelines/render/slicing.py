@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import Field, InputError, Similarity, load_field
+from ...neural_fields.backend.arrays import Float64
 from ...neural_fields.meshing.extract import extract_mesh, surface_needed
 from ..training.folder import chosen_level, find_field
 from .film import ANIMATIONS, write_animation
 from .legend import with_legend
 from .picture import Image, write_picture
 from .slice import draw_slice, plane_axes, round_step, take_slice
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

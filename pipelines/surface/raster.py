@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
+from ...neural_fields.backend.arrays import Float64, Int64
+
 Faces = NDArray[np.integer]
 
 

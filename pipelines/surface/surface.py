@@ -283,14 +283,13 @@ def in_region(mesh: Mesh) -> Mesh | None:
 
     Outside, no ray is ever sampled, so that a network may have any sign there.
     """
-    part = within_sphere(mesh)
-    return None if part is None else without_voids(part)
+    kept = in_sphere(mesh)
+    return without_voids(keep_faces(mesh, kept)) if kept.any() else None
 
 
-def within_sphere(mesh: Mesh) -> Mesh | None:
-    """The faces with all corners in the unit sphere; None if there is none."""
-    kept = ((mesh.vertices**2).sum(axis=1) <= 1)[mesh.faces].all(axis=1)
-    return keep_faces(mesh, kept) if kept.any() else None
+def in_sphere(mesh: Mesh) -> NDArray[np.bool_]:
+    """Which faces ``(F,)`` have all corners in the unit sphere."""
+    return ((mesh.vertices**2).sum(axis=1) <= 1)[mesh.faces].all(axis=1)
 
 
 def trim_distance(mesh: Mesh, points: NDArray[np.floating], distance: float) -> Mesh:

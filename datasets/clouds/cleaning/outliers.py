@@ -15,10 +15,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from ....neural_fields.backend.arrays import Mask
 from ..point_cloud import Float64, Int64, centred
 from .orientation import blocks, fit_planes, query
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -13,15 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ....neural_fields import InputError
+from ....neural_fields.backend.arrays import Int64
 from ....neural_fields.backend.files import natural
 from ...cameras import Camera, Float64, intrinsics
 from .shots import IMAGE_SUFFIXES, Shot
-
-Int64 = NDArray[np.int64]
 
 MODELS = {  # name: number of parameters; the order is that of the binary files' numbers
     "SIMPLE_PINHOLE": 3,

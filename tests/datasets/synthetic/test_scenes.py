@@ -10,7 +10,7 @@ from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.clouds.point_cloud import unit_rows
 from mplicits.datasets.synthetic import corner, scenes
 from mplicits.datasets.synthetic.samples import sample_surface
-from mplicits.datasets.synthetic.scenes import LAMP, SCENES, Scene, render_scene, render_view
+from mplicits.datasets.synthetic.scenes import LAMP, SCENES, Scene, pictures, render_scene
 from mplicits.neural_fields import Box, Similarity
 from mplicits.neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 
@@ -33,7 +33,7 @@ def sphere_hits(camera, radius=0.6):
 
 def test_pixels_have_the_colour_of_the_point_they_see(sphere):
     camera = look_at((1.2, 0.9, 2.0), (0.1, 0.0, -0.1), fov=32, width=23, height=17)
-    color, mask = render_view(sphere, camera, samples=1)
+    ((color, mask),) = pictures(sphere, [camera], samples=1)
     expected, points = sphere_hits(camera)
     assert 100 < expected.sum() < expected.size
     assert np.array_equal(mask, expected.astype(np.float32))
@@ -63,7 +63,7 @@ def test_views_that_are_traced_together_show_what_each_does_alone(at_once, monke
     assert max(traced) <= max(at_once, 2 * 16, 8**2)
     monkeypatch.undo()
     for view in images.views:
-        color, mask = render_view(scene, view.camera, samples=2, shaded=True)
+        ((color, mask),) = pictures(scene, [view.camera], samples=2, shaded=True)
         np.testing.assert_allclose(view.color, color, atol=1e-6)
         np.testing.assert_allclose(view.mask, mask, atol=1e-6)
         alone = scenes.scene_depths(scene, [view.camera])[0]
@@ -72,7 +72,7 @@ def test_views_that_are_traced_together_show_what_each_does_alone(at_once, monke
 
 def test_samples_of_a_pixel_are_averaged_in_linear_light(sphere):
     camera = look_at((0.0, 0.0, 2.4), (0.5, 0.0, 0.0), fov=20, width=12, height=10)
-    color, mask = render_view(sphere, camera, samples=3)
+    ((color, mask),) = pictures(sphere, [camera], samples=3)
     hit, points = sphere_hits(camera.resized(36, 30))
     light = np.where(hit[..., None], srgb_to_linear(sphere.color(points.reshape(-1, 3))).reshape(30, 36, 3), 0)
     count = hit.reshape(10, 3, 12, 3).sum(axis=(1, 3))
@@ -84,7 +84,7 @@ def test_samples_of_a_pixel_are_averaged_in_linear_light(sphere):
 
 def test_shading_is_lambert_times_the_paint(sphere):
     camera = look_at((0.5, 1.0, 2.0), (0, 0, 0), fov=32, width=15, height=15)
-    color, mask = render_view(sphere, camera, samples=1, shaded=True)
+    ((color, mask),) = pictures(sphere, [camera], samples=1, shaded=True)
     hit, points = sphere_hits(camera)
     cosine = points[hit] / 0.6 @ (np.array(LAMP) / np.linalg.norm(LAMP))
     shade = scenes.AMBIENT + (1 - scenes.AMBIENT) * cosine.clip(0)
@@ -99,7 +99,7 @@ def test_gloss_is_the_mirror_image_of_the_lamp(sphere):
     lamp = np.array(LAMP) / np.linalg.norm(LAMP)
     for eye in ((0.5, 1.0, 2.0), (2.0, 1.0, 1.0)):
         camera = look_at(eye, (0, 0, 0), fov=32, width=41, height=41)
-        plain, shiny = (render_view(sphere, camera, samples=1, glossy=glossy)[0] for glossy in (False, True))
+        plain, shiny = (pictures(sphere, [camera], samples=1, glossy=glossy)[0][0] for glossy in (False, True))
         more = (srgb_to_linear(shiny) - srgb_to_linear(plain))[..., 0]
         hit, points = sphere_hits(camera)
         assert not more[~hit].any()
@@ -110,7 +110,7 @@ def test_gloss_is_the_mirror_image_of_the_lamp(sphere):
         clipped = srgb_to_linear(plain)[..., 0] + wanted > 1
         assert np.abs(more - wanted)[hit & ~clipped].max() < 1e-5
         assert wanted.max() > 0.5
-        shade, lit_too = (render_view(sphere, camera, samples=1, shaded=True, glossy=g)[0] for g in (False, True))
+        shade, lit_too = (pictures(sphere, [camera], 1, shaded=True, glossy=g)[0][0] for g in (False, True))
         assert (lit_too >= shade - 1e-6).all()
 
 
@@ -119,7 +119,7 @@ def test_a_box_covers_a_square_with_even_edges():
     scene = Scene("box", Box(half_size=(0.3, 0.3, 0.3)), lambda points: np.ones_like(points), radius=0.55)
     for size in (20, 15, 25):  # focal lengths of twice as many pixels
         camera = look_at((0, 0, 2.3), (0, 0, 0), fov=2 * math.degrees(math.atan(0.25)), width=size, height=size)
-        _, mask = render_view(scene, camera, samples=3)
+        ((_, mask),) = pictures(scene, [camera], samples=3)
         seen = np.arange(size) // (size // 5)  # the middle three fifths
         assert mask[size // 2].tolist() == mask[:, size // 2].tolist() == ((seen > 0) & (seen < 4)).tolist()
 

@@ -15,7 +15,7 @@ def joined(parts):
     normals = np.concatenate([part.mesh.normals for part in last])
     faces = np.concatenate([part.mesh.faces + start for part, start in zip(last, starts, strict=False)])
     rows = np.concatenate([part.shared + start for part, start in zip(last, starts, strict=False)])
-    edges = np.concatenate([part.edges for part in last])
+    edges = np.concatenate([part.border.edges for part in last])
     _, first, place = np.unique(edges, return_index=True, return_inverse=True)
     number = np.arange(len(vertices))
     number[rows] = rows[first[place]]
@@ -67,3 +67,18 @@ def test_wrong_arguments_and_no_surface():
         next(extract_parts(Sphere(), resolution=32, cells=12))
     with pytest.raises(NoSurfaceError):
         next(extract_parts(Sphere(radius=0.5), resolution=32, bounds=((0.9, 0.9, 0.9), (1, 1, 1))))
+
+
+def test_an_interrupted_extraction_goes_on_from_the_parts_that_came():
+    bumps = FunctionField(lambda x: x.norm(dim=-1) - 0.6 + 0.15 * (30 * x).sin().prod(dim=-1))
+    settings = {"resolution": 48, "cells": 8, "lipschitz": 0.5}
+    parts = list(extract_parts(bumps, **settings))
+    whole = joined(parts)
+    for came in (1, len(parts) // 2, len(parts) - 1):
+        known = {part.place: part for part in parts[:came]}
+        rest = list(extract_parts(bumps, **settings, known={place: part.border for place, part in known.items()}))
+        assert len(known) + len(rest) <= len(parts)
+        mesh = joined([*known.values(), *rest])
+        assert_closed(mesh)
+        assert np.array_equal(ordered(mesh.vertices), ordered(whole.vertices))
+    assert not list(extract_parts(bumps, **settings, known={part.place: part.border for part in parts}))

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.neural_fields import Box, InputError, Similarity, Sphere, Union, save_field
+from mplicits.neural_fields.backend import files
+from mplicits.neural_fields.meshing.parts import extract_parts
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh import scene
 from mplicits.pipelines.mesh.scene import SceneOptions, ply_of_run, scene_of_run
 from mplicits.pipelines.surface.surface import Support
+from refusals import refused
 
 HOME = Similarity((512_345.0, 5_403_210.0, 312.5), 40.0)  # metres of UTM zone 32
 
@@ -173,6 +176,72 @@ def test_an_older_scene_is_replaced_and_nothing_else(run, tmp_path, capsys):
     assert (full / "thesis.tex").is_file()
     errors = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert len(errors) == 4
+
+
+def contents(path):
+    """The bytes of a file, or of all files of a folder, by name."""
+    return {str(file.relative_to(path)): file.read_bytes() for file in [path, *path.rglob("*")] if file.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("name", "stage", "done"),
+    [
+        ("mesh.ply", "tiles of 64", 3),
+        ("mesh.ply", "writing", 2),
+        ("scene", "tiles of 64", 3),
+        ("scene", "tiles of 16", 1),
+        ("scene", "writing", 2),
+    ],
+)
+def test_an_interrupted_command_goes_on_from_its_parts(tmp_path, monkeypatch, name, stage, done):
+    run, make = tmp_path / "field.safetensors", ply_of_run if name == "mesh.ply" else scene_of_run
+    save_field(run, Union(Sphere(center=(-0.5, 0, 0), radius=0.3), Sphere(center=(0.5, 0, 0), radius=0.3)))
+    monkeypatch.setattr(scene, "read_support", lambda *_: two_balls())
+    options, whole, out = SceneOptions(resolution=64, cells=16), tmp_path / "whole" / name, tmp_path / "again" / name
+    extracted, stopped = [], []
+
+    def counted_parts(*args, **settings):
+        for part in extract_parts(*args, **settings):
+            extracted.append(part.place)
+            yield part
+
+    def stop(progress):
+        if progress.stage.startswith(stage) and progress.step == done and not stopped:
+            stopped.append(progress)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(scene, "extract_parts", counted_parts)
+    make(run, whole, options)
+    once = len(extracted)
+    extracted.clear()
+    with pytest.raises(KeyboardInterrupt):
+        make(run, out, options, report=stop)
+    assert not out.exists()
+    make(run, out, options)
+    assert once <= len(extracted) <= once + 1  # the one that was under way is extracted again
+    assert contents(out) == contents(whole)
+    assert [path.name for path in out.parent.iterdir()] == [name]
+
+
+def test_a_full_disk_keeps_the_parts_and_other_settings_do_not(run, tmp_path, monkeypatch):
+    out, options = tmp_path / "mesh.ply", SceneOptions(resolution=64, cells=16)
+    rename, room = files.rename, [5]
+
+    def rename_while_there_is_room(path, target):
+        room[0] -= target.suffix == ".npz"
+        if room[0] < 0:
+            raise OSError(28, "No space left on device")
+        rename(path, target)
+
+    monkeypatch.setattr(files, "rename", rename_while_there_is_room)
+    for _ in range(2):
+        with refused(tmp_path / ".mesh.ply.parts", "No space left on device"):
+            ply_of_run(run, out, options)
+        assert len([*(tmp_path / ".mesh.ply.parts" / "parts").glob("*.npz")]) == 5
+    room[0] = 10**6
+    ply_of_run(run, out, SceneOptions(resolution=64, cells=32))
+    assert 10**6 - room[0] == 8  # all eight cubes of this size
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["field.safetensors", "mesh.ply"]
 
 
 def test_a_place_outside_of_the_system_is_refused(tmp_path):

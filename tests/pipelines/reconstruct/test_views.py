@@ -11,7 +11,7 @@ import torch
 import trimesh
 from mplicits.datasets import SCENES, PosedImage, look_at, write_transforms
 from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
-from mplicits.datasets.synthetic.scenes import render_view
+from mplicits.datasets.synthetic.scenes import pictures
 from mplicits.neural_fields import Mesh, Similarity, Sphere, Union, extract_mesh, save_field
 from mplicits.neural_fields.networks.grids import ValueGrid
 from mplicits.neural_fields.volume.render import Sampling
@@ -103,7 +103,7 @@ def test_a_sharp_sphere_looks_like_its_exact_picture() -> None:
     color, camera = view.color, view.camera
     image = posed.render_camera(model, camera, Sampling())
     assert image.color.shape == image.normal.shape == (24, 24, 3)
-    _, fine = render_view(SCENES["painted-sphere"](), camera, samples=5)
+    ((_, fine),) = pictures(SCENES["painted-sphere"](), [camera], samples=5)
     inner, outer = fine == 1, fine == 0  # without the pixels that the outline crosses
     assert inner.sum() > 100
     assert outer.sum() > 50

@@ -10,7 +10,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from mplicits.datasets import look_at, read_cameras
-from mplicits.datasets.synthetic.scenes import render_view
+from mplicits.datasets.synthetic.scenes import pictures
 from mplicits.datasets.views.poses import colmap_process
 from mplicits.datasets.views.poses import find_cameras as module
 from mplicits.datasets.views.poses.colmap_process import Found
@@ -34,8 +34,8 @@ def write(folder: Path, *pictures: np.ndarray) -> Path:
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras = [look_at(eye, (0, 0, 0), fov=FOV, width=SIZE, height=SIZE) for eye in EYES]
-    pictures = [render_view(SPECKLED, camera, samples=2)[0] for camera in cameras]
-    return write(tmp_path_factory.mktemp("photographs") / "data", *pictures)
+    shown = [color for color, _ in pictures(SPECKLED, cameras, samples=2)]
+    return write(tmp_path_factory.mktemp("photographs") / "data", *shown)
 
 
 @pytest.fixture

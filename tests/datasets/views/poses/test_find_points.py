@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mplicits.datasets import look_at, read_cameras
-from mplicits.datasets.synthetic.scenes import render_view
+from mplicits.datasets.synthetic.scenes import pictures
 from mplicits.datasets.views.images import PosedImage, PosedImages, read_posed_images
 from mplicits.datasets.views.poses import find_points as module
 from mplicits.datasets.views.poses.colmap_process import Found
@@ -27,7 +27,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     views = []
     for number, eye in enumerate(eyes(VIEWS, DISTANCE)):
         camera = look_at(eye, (0, 0, 0), fov=FOV, width=SIZE, height=SIZE)
-        views.append(PosedImage(f"{number}.png", camera, *render_view(SPECKLED, camera, samples=2)))
+        views.append(PosedImage(f"{number}.png", camera, *pictures(SPECKLED, [camera], samples=2)[0]))
     folder = tmp_path_factory.mktemp("photographs") / "data"
     write_transforms(folder, PosedImages(tuple(views), Similarity.identity(), "", None, Path()))
     return folder
