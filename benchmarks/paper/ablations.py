@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mplicits.neural_fields import MultiscaleSDF, Similarity
 from mplicits.pipelines.fit.cloud import CloudDistance
-from mplicits.pipelines.fit.samples import Weights, banded_sources
+from mplicits.pipelines.fit.samples import banded_sources
 from mplicits.pipelines.surface.distance import Float64, MeshDistance
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Report
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class Constraint(NamedTuple):
-    """One term of the loss: its name in the paper and in `Weights`, and the paper's table."""
+    """One term of the loss: its name in the paper and in `Source`, and the paper's table."""
 
     title: str
     term: str
@@ -88,7 +88,7 @@ class LossWeights(Method[PaperJob]):
         delta = float(base.field.deltas[level - 1])
         outputs = []
         for weight in WEIGHTS[job.preset]:
-            weights = Weights(**{{"gradient": "eikonal", "normal": "normal", "sdf": "data"}[constraint]: weight})
+            weights = {{"gradient": "eikonal", "normal": "normal", "sdf": "data"}[constraint]: weight}
             field = _next_level(
                 index, previous, delta, config, weights, context.progress, f"{constraint} weight {weight:g}"
             )
@@ -118,7 +118,7 @@ class DeltaFactor(Method[PaperJob]):
         for name in LEVELS:
             delta = delta_after(index, field, config)
             field = _next_level(
-                index, field, delta, config, Weights(), context.progress, f"δ × {1 + config.epsilon:g}, {name}"
+                index, field, delta, config, {}, context.progress, f"δ × {1 + config.epsilon:g}, {name}"
             )
             outputs.append({"name": name, "error": truth.error(field)})
         return Results(tuple(outputs), deltas=tuple(field.deltas.tolist()))
@@ -144,13 +144,16 @@ def _next_level(
     previous: MultiscaleSDF,
     delta: float,
     config: FitConfig,
-    weights: Weights,
+    weights: Mapping[str, float],
     progress: Report | None,
     stage: str,
 ) -> MultiscaleSDF:
-    """``previous`` with one more residual level, newly trained."""
+    """``previous`` with one more residual level, newly trained; ``weights`` replace those of terms that count."""
     generator = generator_for(config, previous.num_levels)
-    sources = banded_sources(index, previous, delta, config, generator=generator, weights=weights)
+    sources = [
+        dataclasses.replace(source, **{name: weight for name, weight in weights.items() if getattr(source, name)})
+        for source in banded_sources(index, previous, delta, config, generator=generator)
+    ]
     network = train_level(previous.num_levels, sources, config, generator=generator, progress=progress, stage=stage)
     return previous.with_level(network, delta=delta)
 

@@ -20,9 +20,9 @@ from mplicits.pipelines.fit.level import LevelObjective, new_level
 from mplicits.pipelines.fit.review import review_points
 from mplicits.pipelines.fit.samples import (
     Source,
-    Weights,
     band_of,
     distance_samples,
+    level_weights,
     surface_samples,
     with_previous,
 )
@@ -122,8 +122,7 @@ def domain_sources(
     everywhere, device = without_bands(previous), previous.like.device
     spread = distance_samples(index, config.samples, generator=generator)
     surface, domain = (with_previous(s, everywhere, math.inf, device=device) for s in (surface_samples(index), spread))
-    assert surface.value is not None
-    data, normal, eikonal = Weights().resolved(config, surface.value, index)
+    data, normal, eikonal = level_weights(config, surface.known("value")[0], index)
     half = config.batch // 2
     return [
         Source("surface", surface, half, data, normal, eikonal),

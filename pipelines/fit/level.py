@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...neural_fields import Field, Siren
 from ...neural_fields.backend.devices import upload
-from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
+from ...neural_fields.fields.losses import data_loss, normal_loss, pseudo_huber
 from ..training.settings import EvolveConfig, FitConfig
 from ..training.trainer import Objective, seeded, siren_groups, without_prefix
 from .cloud import drawn
@@ -279,20 +279,17 @@ class Judge:
         self.data, self.normal, self.count = data, normal, len(self.samples)
         self.guessed, self.noisy = guessed, noisy
         self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing, options=self.options))
-        assert self.samples.value is not None
-        assert self.samples.gradient is not None
+        value, gradient = self.samples.known("value", "gradient")
         # Squares of distances at level 1 are mostly those of few points that level 0 has missed.
-        usual = math.inf if not self.count else float(self.samples.value.square().median())
+        usual = math.inf if not self.count else float(value.square().median())
         self.scales = scales._replace(data=min(scales.data, max(usual, LEAST.data)))
-        self.without = self._errors(self.samples.value, self.samples.gradient)
+        self.without = self._errors(value, gradient)
         self.before = self.without.mean()
 
     @torch.no_grad()
     def errors(self, siren: Siren) -> Each:
         """Errors with the residual ``siren`` added to the levels before; `without` are those without it."""
-        value, gradient = self.samples.value, self.samples.gradient
-        assert value is not None
-        assert gradient is not None
+        value, gradient = self.samples.known("value", "gradient")
         jet = siren.jet(self.samples.points)
         return self._errors(value + jet.value, gradient + jet.gradient)
 
@@ -311,16 +308,13 @@ class Judge:
         return Verdict(self.count, self.before, each.mean(), at, fall, guessed=self.guessed, noisy=self.noisy)
 
     def _errors(self, value: Tensor, gradient: Tensor) -> Each:
-        distance, normal = self.samples.distance, self.samples.normal
-        assert distance is not None
-        assert normal is not None
-        assert self.samples.area is not None
+        distance, normal, area = self.samples.known("distance", "normal", "area")
         data, turn = data_loss(value, distance), normal_loss(gradient, normal)
         # From the chord: the cosine of a small angle rounds to 1.
         chord = (torch.nn.functional.normalize(gradient, dim=1) - normal).norm(dim=1)
         angle = torch.rad2deg(2 * (chord.clamp(max=2) / 2).asin())
         loss = self.data * pseudo_huber(data, self.scales.data) + self.normal * pseudo_huber(turn, self.scales.normal)
-        return Each(loss, data.sqrt(), angle, self.samples.area)
+        return Each(loss, data.sqrt(), angle, area)
 
 
 class LevelObjective(Objective):
@@ -362,14 +356,8 @@ class LevelObjective(Objective):
         for source, batch, value, gradient in pieces:
             if batch.value is not None and batch.gradient is not None:
                 value, gradient = value + batch.value, gradient + batch.gradient
-            scales = source.scales
-            parts = [("eikonal", source.eikonal, eikonal_loss(gradient), scales.eikonal)]
-            if batch.distance is not None:
-                parts.append(("data", source.data, data_loss(value, batch.distance), scales.data))
-            if batch.normal is not None:
-                parts.append(("normal", source.normal, normal_loss(gradient, batch.normal), scales.normal))
-            for name, weight, loss, scale in parts:
-                mean = pseudo_huber(loss, scale).mean()
+            for name, weight, loss in source.terms(value, gradient, batch):
+                mean = loss.mean()
                 total = total + weight * mean
                 terms[f"{source.name}.{name}"] = mean
         return terms, total

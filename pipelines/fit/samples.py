@@ -6,7 +6,7 @@ Samples are made once, with the value and gradient of the frozen levels, so that
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Field, InputError
-from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss
+from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
 from ..training.settings import FitConfig
 from .cloud import CLOUD, CloudDistance
 
@@ -78,6 +78,12 @@ class Samples(Rows):
     gradient: Tensor | None = None
     area: Tensor | None = None  # weights for drawing; None for equal ones
 
+    def known(self, *names: str) -> list[Tensor]:
+        """Columns that have to be there."""
+        columns = [getattr(self, name) for name in names]
+        assert not any(column is None for column in columns), names
+        return columns
+
 
 class RobustScales(NamedTuple):
     """Robust scale of each term of Eq. 4, see `pseudo_huber`; infinity leaves a term squared."""
@@ -103,23 +109,39 @@ class Source:
     eikonal: float  # weight of (|∇f| − 1)²
     scales: RobustScales = SQUARES
 
+    def terms(self, value: Tensor, gradient: Tensor, batch: Samples) -> Iterator[tuple[str, float, Tensor]]:
+        """Name, weight and losses ``(n,)`` of each term at some of the samples, for the jet of a field there."""
+        scales = self.scales
+        yield "eikonal", self.eikonal, pseudo_huber(eikonal_loss(gradient), scales.eikonal)
+        if batch.distance is not None:
+            yield "data", self.data, pseudo_huber(data_loss(value, batch.distance), scales.data)
+        if batch.normal is not None:
+            yield "normal", self.normal, pseudo_huber(normal_loss(gradient, batch.normal), scales.normal)
 
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the three terms of Eq. 4; None for the weight of the fit."""
+    def begins(self) -> float:
+        """The weighted sum of its terms with the levels before alone."""
+        area = torch.ones_like(self.samples.points[:, 0]) if self.samples.area is None else self.samples.area
+        value, gradient = self.samples.known("value", "gradient")
+        terms = self.terms(value, gradient, self.samples)
+        return float(sum(weight * (area * loss).sum() for _, weight, loss in terms) / area.sum())
 
-    data: float | None = None  # by default `FitConfig.data_weight_after`
-    normal: float | None = None
-    eikonal: float | None = None
+    def held_back(self, others: Sequence[Source]) -> Source:
+        """The source that begins with no more loss than the ``others``; errors above their median count linearly.
 
-    def resolved(self, config: FitConfig, errors: Tensor, cloud: CloudDistance) -> tuple[float, float, float]:
-        """Data, normal and eikonal weight, for ``errors`` ``(n,)`` of the levels before at the surface samples."""
-        noise = SAMPLING.left * cloud.noise if cloud.guessed else cloud.noise
-        data = config.data_weight_after(float(errors.square().mean()), noise)
-        given = (self.data, self.normal, self.eikonal)
-        normal, slope = (SAMPLING.guessed_normal, SAMPLING.guessed_slope) if cloud.guessed else (1.0, 1.0)
-        default = (data, normal * config.normal_weight, slope * config.eikonal_weight)
-        return tuple(d if g is None else g for g, d in zip(given, default, strict=True))  # pyright: ignore[reportReturnType]
+        Far places with errors as large as the band would else be all that a level learns from.
+        """
+        usual = max(float(data_loss(*self.samples.known("value", "distance")).median()), LEAST.data)
+        source = replace(self, scales=self.scales._replace(data=usual))
+        share = sum(other.begins() for other in others) / max(source.begins(), 1e-30)
+        return replace(source, data=min(max(share, 0.0), 1.0) * self.data)
+
+
+def level_weights(config: FitConfig, errors: Tensor, cloud: CloudDistance) -> tuple[float, float, float]:
+    """Data, normal and eikonal weight of a level, for ``errors`` ``(n,)`` of those before at the surface samples."""
+    noise = SAMPLING.left * cloud.noise if cloud.guessed else cloud.noise
+    data = config.data_weight_after(float(errors.square().mean()), noise)
+    normal, slope = (SAMPLING.guessed_normal, SAMPLING.guessed_slope) if cloud.guessed else (1.0, 1.0)
+    return data, normal * config.normal_weight, slope * config.eikonal_weight
 
 
 def first_sources(
@@ -142,14 +164,13 @@ def banded_sources(
     config: FitConfig,
     *,
     generator: torch.Generator,
-    weights: Weights | None = None,
     name: str = "cloud",
     options: SampleOptions = SAMPLING,
 ) -> list[Source]:
     """Sources of a residual level: the cloud, and offset, band and off-surface samples around ``previous`` (Sec. 3.2).
 
-    Where normals were estimated, `near_samples` replace the offsets, which rely on the sign of each normal. ``weights``
-    replace those of the fit. Without samples of a kind, an `InputError` calls the cloud ``name``.
+    Where normals were estimated, `near_samples` replace the offsets, which rely on the sign of each normal. Without
+    samples of a kind, an `InputError` calls the cloud ``name``.
     """
     device = previous.like.device
     if index.guessed:
@@ -168,8 +189,7 @@ def banded_sources(
                 "(--steps) or widen the band (--epsilon)"
             )
     surface = kept["surface"]
-    assert surface.value is not None
-    terms = (weights or Weights()).resolved(config, surface.value, index)
+    terms = level_weights(config, surface.known("value")[0], index)
     third = config.batch // 3
     scales = robust_scales(surface, kept["band"]) if config.robust_normals else SQUARES
     if previous.num_levels == 1:  # squares reach corners and thin parts that level 0 has missed
@@ -182,7 +202,8 @@ def banded_sources(
     )
     for kind, samples in found._asdict().items():
         if len(samples) >= options.fewest:
-            sources.append(Source(kind, samples, third // 4, terms[0], 0.0, 0.0))
+            source = Source(kind, samples, third // 4, terms[0], 0.0, 0.0)
+            sources.append(source.held_back(sources) if kind == "clear" else source)
     return sources
 
 
@@ -192,15 +213,10 @@ def robust_scales(surface: Samples, band: Samples) -> RobustScales:
     Errors at sharp edges are about ten times those of faces. Squared, they would dominate the loss and leave waves on
     the faces.
     """
-    assert surface.value is not None
-    assert surface.distance is not None
-    assert surface.gradient is not None
-    assert surface.normal is not None
-    assert band.gradient is not None
     losses = (
-        data_loss(surface.value, surface.distance),
-        normal_loss(surface.gradient, surface.normal),
-        eikonal_loss(band.gradient),
+        data_loss(*surface.known("value", "distance")),
+        normal_loss(*surface.known("gradient", "normal")),
+        eikonal_loss(*band.known("gradient")),
     )
     return RobustScales(*(max(float(loss.quantile(0.5)), least) for loss, least in zip(losses, LEAST, strict=True)))
 
@@ -251,8 +267,7 @@ def off_surface_samples(
     """
 
     def found(samples: Samples, *, lost_only: bool = False) -> OffSurface:
-        points, value = samples.points.cpu().numpy(), samples.value
-        assert value is not None
+        points, (value,) = samples.points.cpu().numpy(), samples.known("value")
         distance, gap = cloud.nearest_gap(points)
         lost = distance - value.abs().cpu().numpy() > np.maximum(delta, options.clear * gap)
         away = np.flatnonzero(lost if lost_only else distance > options.clear * gap + CLOUD.chance * cloud.noise)

@@ -6,6 +6,7 @@ import torch
 from mplicits.datasets import sample_torus
 from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
 from mplicits.neural_fields import Field, MultiscaleSDF, Siren, Sphere, Torus, Union
+from mplicits.neural_fields.fields.losses import pseudo_huber
 from mplicits.neural_fields.fields.primitives import Evaluated
 from mplicits.pipelines.fit import samples as module
 from mplicits.pipelines.fit.cloud import CLOUD, CloudDistance
@@ -280,12 +281,13 @@ def test_the_next_level_leaves_the_closing_of_a_hole_as_it_is() -> None:
 
 
 def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> None:
-    previous = MultiscaleSDF(Union(Sphere(radius=RADIUS), PHANTOM), [], [])
+    """Beside a surface that is wrong as well, as that of any level is: what is clear of it may not outweigh it."""
+    previous = MultiscaleSDF(Union(Sphere(radius=RADIUS + 0.01), PHANTOM), [], [])
     names, field = with_next_level(cloud, previous, 20.0, 150)
     assert names == ["surface", "offset", "band", "clear"]
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator()), dim=1)
     shell = torch.tensor([0.85, 0.0, 0.0]) + 0.1 * directions
-    outside = shell[shell.norm(dim=1) > RADIUS + 0.1]
+    outside = shell[shell.norm(dim=1) > RADIUS + 0.11]
     assert previous.value(outside).abs().max() < 1e-5
     assert field.value(outside).min() > 0.02
     assert field.value(torch.from_numpy(cloud.points)).square().mean().sqrt() < 0.01
@@ -311,16 +313,28 @@ def test_near_a_cloud_of_guessed_normals_winding_numbers_tell_the_side() -> None
     assert [source.name for source in sources] == ["surface", "near", "band"]
     weights = 0.1 * config.normal_weight, 0.2 * config.eikonal_weight
     assert {(source.normal, source.eikonal) for source in sources} == {weights}
-    fixed = module.Weights(normal=1.0, eikonal=2.0)
-    sources = module.banded_sources(cloud, previous, delta, config, generator=generator(), weights=fixed)
-    assert {(source.normal, source.eikonal) for source in sources} == {(1.0, 2.0)}
+
+
+def test_clear_places_begin_with_no_more_loss_than_the_others(cloud: CloudDistance) -> None:
+    """A phantom of the size of the band, whose errors would be most of the loss."""
+    previous, config = Union(Sphere(radius=RADIUS + 0.01), PHANTOM), FitConfig(samples=100_000)
+    *others, clear = module.banded_sources(cloud, previous, 0.05, config, generator=generator())
+    assert clear.name == "clear"
+    value, distance = clear.samples.known("value", "distance")
+    error, area = (value - distance).square(), clear.samples.area
+    assert clear.scales.data == pytest.approx(float(error.median()))
+    loss = float((area * pseudo_huber(error, clear.scales.data)).sum() / area.sum())
+    begun = sum(source.begins() for source in others)
+    assert others[0].data * loss > begun, "this shows nothing"
+    assert clear.begins() == pytest.approx(clear.data * loss, rel=1e-5)
+    assert clear.begins() == pytest.approx(begun, rel=1e-5)
 
 
 @pytest.mark.parametrize(("guessed", "left"), [(True, module.SAMPLING.left), (False, 1.0)])
 def test_distances_are_weighed_by_the_noise_that_is_left(guessed: bool, left: float) -> None:
     cloud, config = CloudDistance(*sphere_points(2000), noise=0.01, guessed=guessed), FitConfig()
     for error, square, noise in ((1e-3, 0.0, left * 0.01), (0.1, 0.01, 0.0)):  # far below the noise, and far above
-        weight = module.Weights().resolved(config, torch.full((2000,), error), cloud)[0]
+        weight = module.level_weights(config, torch.full((2000,), error), cloud)[0]
         assert weight == pytest.approx(config.data_weight_after(square, noise))
 
 
