@@ -18,7 +18,7 @@ Place = tuple[int, int, int]
 
 
 class Border(NamedTuple):
-    """What neighbours need of a part: what is known on the sides of its cube.
+    """What neighbours need of a part: values and vertices on the sides of its cube.
 
     Attributes:
         points: ``(P, 3)`` lattice points at which the field was evaluated.

@@ -236,11 +236,11 @@ class _Source(NamedTuple):
             ):
                 arrays = {name: getattr(part.mesh, name) for name in ("vertices", "faces", "normals")}
                 arrays |= {"shared": part.shared} | {f"border_{name}": x for name, x in part.border._asdict().items()}
-                with whole_file(folder / f"{_name(part.place)}.npz") as partial:
+                path = folder / f"{_name(part.place)}.npz"
+                if "region" in self.record:
+                    _cut(path, in_sphere(part.mesh))
+                with whole_file(path) as partial:
                     np.savez(partial, allow_pickle=False, **arrays)
-        if "region" in self.record:
-            for path in _files(folder):
-                _cut(path, in_sphere(_kept(path, whole=True)[0]))
         if self.support is not None and not self.support.visible and not options.keep_unsupported:
             _drop_unsupported(folder, self.support)
 
