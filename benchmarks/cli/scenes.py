@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
@@ -102,6 +103,9 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     return run_benches(arguments, [ReconstructBench(scenes=scenes, config=config, **options)], out=arguments.out)
 
 
+PART_NAMES = ("none", "correlation", "flatness", "both")
+
+
 def _consistency_arguments(parser: argparse.ArgumentParser) -> None:
     folder_flag(parser)
     parser.add_argument(
@@ -111,23 +115,25 @@ def _consistency_arguments(parser: argparse.ArgumentParser) -> None:
     what = "images of N × N pixels, or of W × H (200x150)"
     parser.add_argument("--size", type=picture_size, default=(200, 150), metavar="N|WxH", help=what)
     number(parser, "--samples", whole(1, 16), 2, "rays per pixel and direction of the images")
-    number(parser, "--weights", float, (0.0, 0.5), "of the term, a training for each", nargs="+")
-    number(parser, "--train-steps", whole(1), (5000, 4000), "of each training: so many that times are alike", nargs="+")
+    what = "of the comparison, one for each training: none, correlation, flatness or both (each of these)"
+    parser.add_argument("--parts", choices=PART_NAMES, default=PART_NAMES, nargs="+", metavar="NAME", help=what)
+    number(parser, "--seeds", whole(1), 1, "trainings of each, with seeds that follow each other")
     measured_flags(parser, 256, 300_000)
     add_flags(parser, "--json")
     add_settings(parser, ReconstructConfig, about="of all trainings")
 
 
 def _consistency(arguments: argparse.Namespace) -> int:
-    for name in ("consistency", "steps"):
-        if name in given_flags(arguments, ReconstructConfig):
-            raise input_error(f"--{name}: differs between the trainings; give --weights and --train-steps")
     config = read_settings(arguments, ReconstructConfig)
+    if not config.consistency:
+        config = replace(config, consistency=0.5)
     from ..scenes.consistency import ConsistencyBench
 
-    options = {name: getattr(arguments, name) for name in ("scene", "views", "size", "resolution", "eval_samples")}
-    options |= {"weights": tuple(arguments.weights), "steps": tuple(arguments.train_steps)}
-    bench = ConsistencyBench(rays=arguments.samples, config=config, device=config.device, **options)
+    options = {
+        name: getattr(arguments, name) for name in ("scene", "views", "size", "seeds", "resolution", "eval_samples")
+    }
+    parts = tuple(arguments.parts)
+    bench = ConsistencyBench(parts=parts, rays=arguments.samples, config=config, device=config.device, **options)
     return run_benches(arguments, [bench], out=arguments.out)
 
 
@@ -286,10 +292,10 @@ SCENES: Mapping[str, Command] = MappingProxyType(
         "consistency": Command(
             "photographs compared with each other, on an exact scene",
             """  python -m benchmarks consistency -o bench
-  python -m benchmarks consistency --size 400x300 --weights 0 0.5 --train-steps 4000 3200 -o bench""",
+  python -m benchmarks consistency --size 400x300 --parts none both --steps 1000000 --time-budget 720 -o bench""",
             _consistency_arguments,
             _consistency,
-            "Train on photographs of an exact scene without and with the comparison of neighbouring photographs: "
+            "Train on photographs of an exact scene with and without each part of the comparison of photographs: "
             "accuracy, completeness, flat walls, edges, held-out views, seconds and memory.",
         ),
         "fault": Command(

@@ -6,18 +6,24 @@ import dataclasses
 import functools
 import resource
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
+from unittest import mock
 
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, scene_mesh
 from mplicits.neural_fields import InputError, extract_mesh
 from mplicits.pipelines.mesh.files import write_mesh
+from mplicits.pipelines.reconstruct import objective
+from mplicits.pipelines.reconstruct.consistency import Surface
 from mplicits.pipelines.reconstruct.train import reconstruct
 from mplicits.pipelines.reconstruct.views import count_views
 from mplicits.pipelines.surface.measure import evaluate_surfaces
 from mplicits.pipelines.surface.surface import in_region
 from mplicits.pipelines.training.settings import ReconstructConfig
+from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part, plain
 from ..harness.jobs import Context
@@ -25,6 +31,15 @@ from ..harness.tables import Column, Figure, Table, tabulated
 from ..shapes.roughness import surface_roughness
 
 THOUSANDTHS = 1e3
+# What is left out of the term for each choice of its parts; without both there is no term.
+PARTS: Mapping[str, Sequence[str]] = MappingProxyType(
+    {
+        "none": ("consistency_loss", "flatness_loss"),
+        "correlation": ("flatness_loss",),
+        "flatness": ("consistency_loss",),
+        "both": (),
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -32,7 +47,8 @@ class ConsistencyRow:
     """A training and its surface; distances are in radii of the region, where a photograph sees the true surface.
 
     Attributes:
-        weight: of the term.
+        parts: of the term, one of `PARTS`.
+        seed: of the training.
         steps: of the training.
         seconds: of the processor, for the training and what comes after it.
         memory: the largest of the process so far, in MiB.
@@ -44,7 +60,8 @@ class ConsistencyRow:
         edge_angle: the same at sharp edges.
     """
 
-    weight: float
+    parts: str
+    seed: int
     steps: int
     seconds: float
     memory: float
@@ -58,16 +75,16 @@ class ConsistencyRow:
 
 @dataclass(frozen=True, kw_only=True)
 class ConsistencyBench(Benchmark[ConsistencyRow]):
-    """The same training with each weight of the term.
+    """The same training with and without each part of the term, in equal time if the settings have a time budget.
 
     Attributes:
-        config: settings of all trainings.
+        config: settings of all trainings, with the weight of the term.
         scene: a name of `SCENES`.
         views: number of pictures.
         size: their width and height in pixels.
         rays: of each pixel and direction.
-        weights: of the term, 0 for none.
-        steps: of each training, one number for each weight.
+        parts: names of `PARTS`, one for each training.
+        seeds: of trainings, this many from that of the settings.
         resolution: of the meshes.
         eval_samples: points on each surface.
     """
@@ -75,25 +92,23 @@ class ConsistencyBench(Benchmark[ConsistencyRow]):
     name = "consistency"
     source = "photographs compared with each other"
     row = ConsistencyRow
-    apart = ("weights", "steps", "config")
+    apart = ("parts", "seeds", "config")
     config: ReconstructConfig
     scene: str = "corner"
     views: int = 49
     size: tuple[int, int] = (200, 150)
     rays: int = 2
-    weights: Sequence[float] = (0.0, 0.5)
-    steps: Sequence[int] = (5000, 4000)
+    parts: Sequence[str] = tuple(PARTS)
+    seeds: int = 1
     resolution: int = 256
     eval_samples: int = 300_000
 
     def jobs(self) -> list[Part]:
-        """One for each weight."""
-        if len(self.steps) != len(self.weights):
-            raise InputError(f"--steps: {len(self.steps)} numbers for {len(self.weights)} weights; give one for each")
-        pairs = zip(self.weights, self.steps, strict=True)
+        """One for each choice of parts and each seed."""
         return [
-            Part(self.name, f"{self.scene}, weight {weight:g}", options=(("weight", weight), ("steps", steps)))
-            for weight, steps in pairs
+            Part(self.name, f"{self.scene}, {parts}, seed {seed}", options=(("parts", parts), ("seed", seed)))
+            for seed in range(self.config.seed, self.config.seed + self.seeds)
+            for parts in self.parts
         ]
 
     def settings(self, job: Part) -> Mapping[str, Any]:
@@ -107,10 +122,12 @@ class ConsistencyBench(Benchmark[ConsistencyRow]):
         images = dataclasses.replace(
             render_scene(exact, self.views, self.size, samples=self.rays), points=None, observations=None
         )
-        weight, steps = job.parameters["weight"], job.parameters["steps"]
-        config = dataclasses.replace(self.config, consistency=weight, steps=steps, texture_steps=0, device=self.device)
+        parts, seed = job.parameters["parts"], job.parameters["seed"]
+        config = dataclasses.replace(self.config, texture_steps=0, device=self.device, seed=seed)
         started = time.process_time()
-        run = reconstruct(images, config, progress=context.progress)
+        weight = 0.0 if parts == "none" else config.consistency
+        with only(parts):
+            run = reconstruct(images, dataclasses.replace(config, consistency=weight), progress=context.progress)
         seconds = time.process_time() - started
         mesh = in_region(extract_mesh(run.field, resolution=self.resolution))
         if mesh is None:
@@ -127,7 +144,8 @@ class ConsistencyBench(Benchmark[ConsistencyRow]):
             raise InputError(f"{job.name}: no photograph sees the surface; give more --views")
         return [
             ConsistencyRow(
-                weight=weight,
+                parts=parts,
+                seed=seed,
                 steps=run.record["steps"],
                 seconds=seconds,
                 memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
@@ -154,8 +172,21 @@ class ConsistencyBench(Benchmark[ConsistencyRow]):
             (Column("s", ".0f"), lambda row: row.seconds),
             (Column("MiB", ".0f"), lambda row: row.memory),
         ]
-        items = [(f"weight {row.weight:g}", row) for row in rows]
+        items = [(f"{row.parts}, seed {row.seed}", row) for row in rows]
         width, height = self.size
         title = f"{self.scene}, {self.views} views of {width} × {height} pixels: photographs compared with each other"
         note = "Distances are in thousandths of the region's radius, where a photograph sees the surface."
         return (tabulated(self.name, title, "term", figures, items, notes=[note]),)
+
+
+@contextmanager
+def only(parts: str) -> Iterator[None]:
+    """Meanwhile scenes are trained with these `PARTS` of the term; the others take no time."""
+    with ExitStack() as stack:
+        for name in PARTS[parts]:
+            stack.enter_context(mock.patch.object(objective, name, _nothing))
+        yield
+
+
+def _nothing(*given: Any, **_: Any) -> Tensor:
+    return next(part for part in given if isinstance(part, Surface)).position.new_zeros(1)
