@@ -76,15 +76,15 @@ class Pixels(NamedTuple):
 
 
 class GreyPictures:
-    """Grey values ``(V, H, W)`` of photographs, padded to one size, and masks as uint8, full without a mask."""
+    """Grey values and masks ``(V, H, W)`` of photographs in 8 bits, padded to one size; masks are full without one."""
 
     def __init__(self, views: Sequence[PosedImage], device: torch.device) -> None:
         self.sizes = torch.tensor([[view.camera.width, view.camera.height] for view in views], device=device)
-        grey, masks = (np.zeros((len(views), *self.sizes.amax(dim=0).tolist()[::-1]), kind) for kind in ("f4", "u1"))
+        grey, masks = np.zeros((2, len(views), *self.sizes.amax(dim=0).tolist()[::-1]), np.uint8)
         for index, view in enumerate(views):
             part = (index, slice(view.camera.height), slice(view.camera.width))
-            grey[part] = view.color.mean(axis=2)
-            masks[part] = 255 if view.mask is None else np.rint(255 * view.mask)
+            grey[part] = np.rint(view.color_bytes.mean(axis=2, dtype=np.float32))
+            masks[part] = 255 if view.mask_bytes is None else view.mask_bytes
         self.grey, self.masks = torch.from_numpy(grey).to(device), torch.from_numpy(masks).to(device)
 
     def contains(self, view: Tensor, pixels: Tensor, margin: float = 0.0) -> Tensor:
@@ -93,14 +93,13 @@ class GreyPictures:
 
     def at(self, view: Tensor, pixels: Tensor) -> Tensor:
         """Grey values ``(...,)`` at pixels ``(..., 2)`` of pictures ``(...,)``, bilinear; differentiable in pixels."""
-        _, height, width = self.grey.shape
-        x, y = torch.minimum(pixels.clamp(min=0), (self.sizes[view] - 1).to(pixels)).unbind(dim=-1)
-        # All pictures are one above the other, so that one call samples any of them.
-        atlas = self.grey.reshape(1, 1, -1, width)
-        u = 2 * x / max(width - 1, 1) - 1
-        v = 2 * (view * height + y) / max(atlas.shape[2] - 1, 1) - 1
-        grid = torch.stack((u, v), dim=-1).reshape(1, 1, -1, 2)
-        return torch.nn.functional.grid_sample(atlas, grid, align_corners=True).reshape(x.shape)
+        place = torch.minimum(pixels.nan_to_num().clamp(min=0), (self.sizes[view] - 1).to(pixels))
+        first = place.detach().long()
+        (x, y), (u, v) = first.unbind(dim=-1), (place - first).unbind(dim=-1)
+        below, right = ((at + 1).clamp(max=size - 1) for at, size in zip((y, x), self.grey.shape[1:], strict=True))
+        rows = ([self.grey[view, row, column].to(pixels) for column in (x, right)] for row in (y, below))
+        upper, lower = (torch.lerp(one, other, u) for one, other in rows)
+        return torch.lerp(upper, lower, v) / 255
 
     def weights(self, view: Tensor, pixels: Tensor) -> Tensor:
         """The share of object ``(...,)`` at pixels ``(..., 2)`` int64 within pictures ``(...,)``; 1 without masks."""
@@ -265,14 +264,11 @@ def flatness_loss(
     far as the photograph has one grey value at x, x ± h t / 2 and x ± h t. In texture and across edges it has not.
     """
     rows, device = len(pixels.view), pixels.view.device
-    number, angle = uniform((2, rows), generator, device).to(surface.position)
+    number, *aside = uniform((4, rows), generator, device).to(surface.position)
     length = options.nearest * (options.furthest / options.nearest) ** number
     middle, normal = surface.position.detach(), surface.normal.detach()
-    # The axis that is least along the normal gives a first tangent, and turning it any other.
-    across = torch.nn.functional.one_hot(normal.abs().argmin(dim=1), 3).to(normal)
-    first = torch.nn.functional.normalize(torch.linalg.cross(normal, across), dim=1)
-    turn = 2 * math.pi * angle[:, None]
-    tangent = turn.cos() * first + turn.sin() * torch.linalg.cross(normal, first)
+    across = torch.linalg.cross(normal, 2 * torch.stack(aside, dim=1) - 1)
+    tangent = torch.nn.functional.normalize(across, dim=1)
     steps = few_numbers((-1.0, 0.0, 1.0, -0.5, 0.5), middle)
     places = middle[:, None] + (steps * length[:, None])[..., None] * tangent[:, None]
     with torch.no_grad():

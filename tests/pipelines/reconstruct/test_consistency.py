@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from fields import solve_sphere
@@ -58,7 +59,6 @@ def scene(*, plain: bool = False) -> tuple[Cameras, GreyPictures, list[Camera]]:
         color = (0 * grey + 0.5 if plain else grey)[..., None].repeat(3, axis=2).astype("float32")
         views.append(PosedImage(f"{number}.png", camera, color, None))
     pictures = GreyPictures(views, torch.device("cpu"))
-    pictures.grey = pictures.grey.double()
     lens = torch.stack([camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras])
     axes = torch.stack([camera.world_from_camera[:3, :3] for camera in cameras])
     return Cameras(torch.stack([camera.eye for camera in cameras]), axes, lens), pictures, cameras
@@ -87,6 +87,20 @@ def loss_of(field: Field, parts: tuple[Cameras, GreyPictures, list[Camera]], opt
     depth = torch.full((len(origins),), 2.4, dtype=torch.float64)
     surface = surface_near(field, origins, directions, depth, options)
     return consistency_loss(surface, pixels, cameras, pictures, distance or field.value, options)
+
+
+def test_grey_values_are_bilinear_and_those_of_the_border_beyond_it() -> None:
+    color = np.arange(24, dtype=np.uint8).reshape(4, 6)[..., None].repeat(3, axis=2)
+    views = [PosedImage("0.png", cameras_at(EYES)[0].resized(6, 4), color / np.float32(255), None)]
+    pictures = GreyPictures(views, torch.device("cpu"))
+    place = torch.tensor([[1.0, 2.0], [0.25, 1.5], [5.0, 3.0], [-7.0, 1.0], [9.0, 99.0], [math.inf, 0.0]])
+    found = pictures.at(torch.zeros(6, dtype=torch.int64), place)
+    torch.testing.assert_close(255 * found, torch.tensor([13.0, 9.25, 23.0, 6.0, 23.0, 5.0]))
+    nowhere = torch.full((1, 2), math.nan, requires_grad=True)
+    value = pictures.at(torch.zeros(1, dtype=torch.int64), nowhere)
+    (slope,) = torch.autograd.grad(value.sum(), nowhere)
+    assert 0 <= float(value.detach()) <= 1
+    assert bool(slope.isfinite().all())
 
 
 def test_the_homography_maps_as_rays_do_that_meet_the_plane() -> None:
@@ -253,10 +267,10 @@ def test_a_crease_stays_where_the_picture_has_an_edge_and_a_dent_goes_where_it_h
     flat = float(loss.detach())
     assert flat > 0
     assert float(slope) > 0  # flatter is better
-    pictures.grey[0, :, WIDTH // 2 :] += 0.3
+    pictures.grey[0, :, WIDTH // 2 :] += 76
     edges = flatness_of(roof, parts).detach()
     # Bilinear grey values rise over one pixel, within which a crossing is not seen.
     assert float(edges.mean()) < 0.02 * flat
-    pictures.grey[0, :, WIDTH // 2 :] -= 0.3
+    pictures.grey[0, :, WIDTH // 2 :] -= 76
     pictures.masks[:] = 0
     assert float(flatness_of(roof, parts).detach().abs().max()) == 0
