@@ -272,12 +272,14 @@ class _Reconstruction(Training[ReconstructConfig, Field]):
         if self.trainer.objective.grid is not None:
             self.trainer.objective.grid.refresh(self.model.geometry)
         if views and limit is not None:
-            # Half of the rest of a time budget is for the texture.
-            room = max(int(limit / 2 / len(views) / self._pixel_seconds()), FINISH.timed_pixels)
-            if room < max(map(_pixels, views)):
-                views = [reduced(view, room) for view in views]
-                camera = views[0].camera
-                self.budget.notes.append(f"held-out views are measured at {camera.width} × {camera.height} pixels")
+            # Fewer views, not smaller ones: rays have no width, and a pixel of a smaller picture is a mean.
+            room = limit / (2 if self.config.texture_steps else 1) / self._pixel_seconds()  # half is for a texture
+            most = int(np.searchsorted(np.cumsum([*map(_pixels, views)]), room, side="right"))
+            if most < len(views):
+                views = views[:most] or [reduced(views[0], max(int(room), FINISH.timed_pixels))]
+                held, camera = len(self.test_views), views[0].camera
+                size = f"{camera.width} × {camera.height} pixels"
+                self.budget.notes.append(f"{len(views)} of {held} held-out views are measured, at {size}")
         for index, view in enumerate(views):
             self.report(Progress("held-out views", index, len(views), index / len(views), {}))
             pairs.append((view, self._image(view)))

@@ -306,16 +306,21 @@ def test_a_budget_counts_all_but_leaves_most_for_the_training(data: Path, tmp_pa
     assert record["texture"]["budget"]["seconds"] < 2.0
 
 
-def test_large_held_out_views_are_measured_small_under_a_budget(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("room", "measured"),
+    [(9000.0, None), (6000.0, "1 of 2 held-out views are measured, at 64 × 64"), (500.0, "at 32 × 32")],
+)
+def test_as_many_held_out_views_are_measured_as_a_budget_has_room_for(
+    room: float, measured: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where a pixel takes a second, all views are measured, at the least size."""
+    """A pixel takes a second. A single view that is too large is measured small."""
     monkeypatch.setattr(train._Reconstruction, "_pixel_seconds", lambda _: 1.0)
+    monkeypatch.setattr(train._Reconstruction, "left", lambda _: room)
     write_neus(tmp_path / "data", painted_sphere(6, 64, 1))
-    config = replace(TINY, texture_steps=0, time_budget=2.0)
-    record = reconstruct(tmp_path / "data", config).record
-    assert len(record["held_out"]["views"]) == 2
-    assert record["budget"]["notes"][-1].endswith("32 × 32 pixels")
+    record = reconstruct(tmp_path / "data", replace(TINY, texture_steps=0, time_budget=2.0)).record
+    notes = " ".join(record["budget"]["notes"])
+    assert len(record["held_out"]["views"]) == (1 if measured else 2)
+    assert measured in notes if measured else "measured" not in notes
 
 
 class Glossy(ColorNetwork):
