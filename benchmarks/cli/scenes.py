@@ -103,7 +103,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     return run_benches(arguments, [ReconstructBench(scenes=scenes, config=config, **options)], out=arguments.out)
 
 
-PART_NAMES = ("none", "correlation", "flatness", "both")
+PART_NAMES = ("none", "correlation", "flatness", "both")  # those of `consistency.PARTS`
 
 
 def _consistency_arguments(parser: argparse.ArgumentParser) -> None:
@@ -125,15 +125,15 @@ def _consistency_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _consistency(arguments: argparse.Namespace) -> int:
     config = read_settings(arguments, ReconstructConfig)
-    if not config.consistency:
+    if "consistency" not in given_flags(arguments, ReconstructConfig):
         config = replace(config, consistency=0.5)
+    if not config.consistency:
+        raise input_error("--consistency 0: trainings differ in the parts of this term; give it a weight")
     from ..scenes.consistency import ConsistencyBench
 
-    options = {
-        name: getattr(arguments, name) for name in ("scene", "views", "size", "seeds", "resolution", "eval_samples")
-    }
-    parts = tuple(arguments.parts)
-    bench = ConsistencyBench(parts=parts, rays=arguments.samples, config=config, device=config.device, **options)
+    names = "scene", "views", "size", "parts", "seeds", "resolution", "eval_samples"
+    options = {name: getattr(arguments, name) for name in names}
+    bench = ConsistencyBench(rays=arguments.samples, config=config, device=config.device, **options)
     return run_benches(arguments, [bench], out=arguments.out)
 
 

@@ -31,14 +31,9 @@ from ..harness.tables import Column, Figure, Table, tabulated
 from ..shapes.roughness import surface_roughness
 
 THOUSANDTHS = 1e3
-# What is left out of the term for each choice of its parts; without both there is no term.
+# Losses that a training of each choice of parts leaves out; that of none has no weight for the whole term.
 PARTS: Mapping[str, Sequence[str]] = MappingProxyType(
-    {
-        "none": ("consistency_loss", "flatness_loss"),
-        "correlation": ("flatness_loss",),
-        "flatness": ("consistency_loss",),
-        "both": (),
-    }
+    {"none": (), "correlation": ("flatness_loss",), "flatness": ("consistency_loss",), "both": ()}
 )
 
 

@@ -133,7 +133,7 @@ class Source:
         usual = max(float(data_loss(*self.samples.known("value", "distance")).median()), LEAST.data)
         source = replace(self, scales=self.scales._replace(data=usual))
         share = sum(other.begins() for other in others) / max(source.begins(), 1e-30)
-        return replace(source, data=min(max(share, 0.0), 1.0) * self.data)
+        return replace(source, data=min(share, 1.0) * self.data)
 
 
 def level_weights(config: FitConfig, errors: Tensor, cloud: CloudDistance) -> tuple[float, float, float]:

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -15,12 +16,14 @@ from mplicits.neural_fields import Jet, Sphere
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct import train as reconstruct_texture
-from mplicits.pipelines.reconstruct.consistency import ConsistencyOptions
+from mplicits.pipelines.reconstruct.consistency import ConsistencyOptions, GreyPictures
+from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.objective import SceneObjective
 from mplicits.pipelines.training.settings import ReconstructConfig, TextureConfig
 from mplicits.pipelines.training.trainer import Trainer
 from torch import Tensor, nn
 
+CPU = torch.device("cpu")
 # Two levels that take no time, for a few steps on a few rays.
 TINY_SCENE = ReconstructConfig(
     widths=(16, 16),
@@ -68,6 +71,18 @@ def with_views(images: PosedImages, change: Callable[[int, PosedImage], PosedIma
 def without(images: PosedImages, part: str) -> PosedImages:
     """The data set without the ``mask`` or ``depth`` of each view."""
     return with_views(images, lambda _, view: replace(view, **{part: None}))
+
+
+def scene_parts(
+    images: PosedImages, config: ReconstructConfig, *, depths: bool = False, device: torch.device = CPU
+) -> tuple[tuple[scene_model.SceneModel, scene_model.RayPool, ReconstructConfig], dict[str, Any]]:
+    """What a training of a scene takes: model, rays and settings; and measured depths and pictures that it wants."""
+    masked = all(view.mask is not None for view in images.views)
+    model = scene_model.build_scene(config, has_masks=masked, views=len(images.views)).to(device)
+    pool = scene_model.RayPool(images.views, images.similarity, device, whole=model.outside is not None)
+    measured = MeasuredDepths(images.views, images, device) if depths else None
+    pictures = GreyPictures(images.views, device) if config.consistency else None
+    return (model, pool, config), {"measured": measured, "pictures": pictures}
 
 
 class Paint(nn.Module):

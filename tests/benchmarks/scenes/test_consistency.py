@@ -8,9 +8,8 @@ import pytest
 import torch
 from fields import solve_sphere
 from mplicits.pipelines.reconstruct import model as scene_model
-from mplicits.pipelines.reconstruct.consistency import GreyPictures
 from mplicits.pipelines.reconstruct.objective import SceneObjective
-from reconstructions import SMALL_PATCHES, TINY_SCENE, painted_sphere
+from reconstructions import SMALL_PATCHES, TINY_SCENE, painted_sphere, scene_parts
 from torch import Tensor
 
 from benchmarks.__main__ import main
@@ -25,19 +24,20 @@ def test_a_row_for_each_choice_of_parts(
     words = f"consistency --views 6 --size 24x18 --samples 1 {small} --importance 4 --march-grid 12 --start sphere"
     words += " --parts none both --steps 4 --resolution 24 --eval-samples 500"
     assert main([*words.split(), "-o", str(tmp_path), "--json", str(tmp_path / "figures.json")]) == 0
-    assert "both, seed 0" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in ("both, seed 0", "accuracy", "completeness", "flat °", "MiB"))
     (table,) = json.loads((tmp_path / "figures.json").read_text())["tables"]
     assert [row["name"] for row in table["rows"]] == ["none, seed 0", "both, seed 0"]
     assert all(number > 0 for row in table["rows"] for number in row["values"][:5])  # angles need finer meshes
+    assert main([*words.split(), "-o", str(tmp_path / "other"), "--consistency", "0"]) == 2
+    assert "give it a weight" in capsys.readouterr().err
 
 
 def terms() -> dict[str, Tensor]:
     """Of a step late in a training of a painted sphere."""
     images, config = painted_sphere(4, 16), replace(TINY_SCENE, consistency=0.5)
-    pool = scene_model.RayPool(images.views, images.similarity, torch.device("cpu"))
-    scene = scene_model.build_scene(config, has_masks=True, views=4)
-    pictures = GreyPictures(images.views, pool.device)
-    made = SceneObjective(scene, pool, config, pictures=pictures).losses(0, 0.9)[0]
+    parts, others = scene_parts(images, config)
+    made = SceneObjective(*parts, **others).losses(0, 0.9)[0]
     return {name: term.detach() for name, term in made.items()}
 
 

@@ -11,9 +11,6 @@ from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields.backend.devices import GraphInputs
 from mplicits.neural_fields.networks.multiscale import fit_sphere
 from mplicits.pipelines.reconstruct import model as scene_model
-from mplicits.pipelines.reconstruct.consistency import GreyPictures
-from mplicits.pipelines.reconstruct.measured import MeasuredDepths
-from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import GraphTrainer, SceneObjective
 from mplicits.pipelines.training.cuda_graphs import (
     CudaGraphRecorder,
@@ -23,7 +20,7 @@ from mplicits.pipelines.training.cuda_graphs import (
     Work,
 )
 from mplicits.pipelines.training.trainer import Trainer
-from reconstructions import QUICK, SMALL_PATCHES, TINY_SCENE, painted_sphere, weights, without
+from reconstructions import QUICK, SMALL_PATCHES, TINY_SCENE, painted_sphere, scene_parts, weights, without
 from recorders import EagerRecorder
 from torch import Tensor
 
@@ -51,14 +48,10 @@ def images() -> PosedImages:
 
 
 def scene(images: PosedImages, name: str, device: torch.device) -> SceneObjective:
-    config = KINDS[name]
-    views = images.views if name != "outside" else without(images, "mask").views
-    pool = RayPool(views, images.similarity, device, whole=config.background == "outside")
-    model = build_scene(config, has_masks=pool.has_masks, views=len(views)).to(device)
-    measured = MeasuredDepths(views, images, device) if name == "depths" else None
-    assert measured is None or len(measured)
-    pictures = GreyPictures(views, device) if config.consistency else None
-    return SceneObjective(model, pool, config, measured, pictures)
+    images = images if name != "outside" else without(images, "mask")
+    parts, others = scene_parts(images, KINDS[name], depths=name == "depths", device=device)
+    assert others["measured"] is None or len(others["measured"])
+    return SceneObjective(*parts, **others)
 
 
 def replaying(images: PosedImages, name: str, device: torch.device) -> GraphTrainer:

@@ -11,13 +11,12 @@ from mplicits.neural_fields import Similarity, fit_sphere
 from mplicits.neural_fields.fields.losses import eikonal_loss
 from mplicits.neural_fields.volume.weights import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
-from mplicits.pipelines.reconstruct.consistency import GreyPictures
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import SceneObjective, Schedule, scene_trainer
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import Progress, StopFlag, Trainer
-from reconstructions import QUICK, SMALL_PATCHES, TINY_SCENE, painted_sphere, weights, with_views, without
+from reconstructions import QUICK, SMALL_PATCHES, TINY_SCENE, painted_sphere, scene_parts, weights, with_views, without
 from torch import Tensor
 
 TINY = replace(TINY_SCENE, steps=8, **QUICK)
@@ -36,11 +35,8 @@ def images() -> PosedImages:
 
 def make(images: PosedImages, config: ReconstructConfig, *, depths: bool = False) -> Trainer[SceneObjective]:
     """A training, with the terms of measured depths and of consistency that are wanted."""
-    pool = RayPool(images.views, images.similarity, torch.device("cpu"))
-    measured = MeasuredDepths(images.views, images, pool.device) if depths else None
-    scene = build_scene(config, has_masks=pool.has_masks, views=len(images.views))
-    pictures = GreyPictures(images.views, pool.device) if config.consistency else None
-    return scene_trainer(scene, pool, config, measured=measured, pictures=pictures)
+    parts, others = scene_parts(images, config, depths=depths)
+    return scene_trainer(*parts, **others)
 
 
 def level(trainer: Trainer[SceneObjective]) -> int:
