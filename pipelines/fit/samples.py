@@ -35,6 +35,7 @@ class SampleOptions:
     guessed_slope: float = 0.2
     left: float = 0.4  # part of the noise that smoothing leaves without normals: median on six shapes with 0.5 and 1 %
     clear: float = 4.0  # distance to all points, in spacings, from which on a place is not between them
+    least: float = 0.5  # of δ: nearer than that to a clear place the surface is not; farther than the points it is not
     right: float = 0.1  # error of a clear place in units of the mean one, with which it is drawn if it has none
     fewest: int = 32  # off-surface samples, below which they get no share of the batch
 
@@ -108,13 +109,15 @@ class Source:
     normal: float  # weight of 1 − cos(∇f, N)
     eikonal: float  # weight of (|∇f| − 1)²
     scales: RobustScales = SQUARES
+    least: float = math.inf  # size of f(x) from which on up to |d| it has no error
 
     def terms(self, value: Tensor, gradient: Tensor, batch: Samples) -> Iterator[tuple[str, float, Tensor]]:
         """Name, weight and losses ``(n,)`` of each term at some of the samples, for the jet of a field there."""
         scales = self.scales
         yield "eikonal", self.eikonal, pseudo_huber(eikonal_loss(gradient), scales.eikonal)
         if batch.distance is not None:
-            yield "data", self.data, pseudo_huber(data_loss(value, batch.distance), scales.data)
+            missed = data_loss(value, nearest_known(value.detach(), batch.distance, self.least))
+            yield "data", self.data, pseudo_huber(missed, scales.data)
         if batch.normal is not None:
             yield "normal", self.normal, pseudo_huber(normal_loss(gradient, batch.normal), scales.normal)
 
@@ -134,6 +137,12 @@ class Source:
         source = replace(self, scales=self.scales._replace(data=usual))
         share = sum(other.begins() for other in others) / max(source.begins(), 1e-30)
         return replace(source, data=min(share, 1.0) * self.data)
+
+
+def nearest_known(value: Tensor, distance: Tensor, least: float) -> Tensor:
+    """The distance nearest to ``value`` that is possible: of the sign of ``distance``, from ``least`` to its size."""
+    nearer = distance.clamp(-least, least)
+    return value.clamp(torch.minimum(nearer, distance), torch.maximum(nearer, distance))
 
 
 def level_weights(config: FitConfig, errors: Tensor, cloud: CloudDistance) -> tuple[float, float, float]:
@@ -203,7 +212,8 @@ def banded_sources(
     for kind, samples in found._asdict().items():
         if len(samples) >= options.fewest:
             source = Source(kind, samples, third // 4, terms[0], 0.0, 0.0)
-            sources.append(source.held_back(sources) if kind == "clear" else source)
+            clear = kind == "clear"
+            sources.append(replace(source, least=options.least * delta).held_back(sources) if clear else source)
     return sources
 
 
@@ -259,11 +269,13 @@ def off_surface_samples(
 ) -> OffSurface:
     """Samples of the band around ``field`` that are far from every point of the cloud; often none.
 
-    ``clear``: the winding number is clear. Their distance is that to the nearest point, up to ±2δ. Without them a level
-    that cannot resolve a thin part closes a volume around it. They are drawn in proportion to the error of the level
-    before, and to the share `right` of the mean error. ``unseen``: the winding number is uncertain, as in holes of
-    scans, and no point is as near as the surface of the level before; they keep its value. ``count`` points are tried,
-    spread as for level 0, of the samples ``band`` a quarter as many, and ``count`` more around unseen ones.
+    ``clear``: the winding number is clear. Their distance is at most that to the nearest point, up to ±2δ, and at least
+    the share `least` of δ. Without them a level that cannot resolve a thin part closes a volume around it. They are
+    drawn in proportion to the error of the level before, and to the share `right` of the mean error.
+
+    ``unseen``: the winding number is uncertain, as in holes of scans, and no point is as near as the surface of the
+    level before; they keep its value. ``count`` points are tried, spread as for level 0, of the samples ``band`` a
+    quarter as many, and ``count`` more around unseen ones.
     """
 
     def found(samples: Samples, *, lost_only: bool = False) -> OffSurface:
@@ -277,7 +289,7 @@ def off_surface_samples(
         rows = torch.from_numpy(away[sure]).to(device)
         length = np.minimum(distance[away[sure]], 2 * delta)
         signed = torch.from_numpy(np.where(depth[sure] > 0, -length, length).astype(np.float32)).to(device)
-        error = (value[rows] - signed).abs()
+        error = (value[rows] - nearest_known(value[rows], signed, options.least * delta)).abs()
         clear = replace(samples.take(rows), distance=signed, area=error + options.right * error.mean())
         return OffSurface(clear, replace(unseen, distance=unseen.value))
 

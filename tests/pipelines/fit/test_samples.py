@@ -1,5 +1,7 @@
 """Samples of a sphere's cloud against what the sphere says."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -218,13 +220,23 @@ def test_clear_places_have_their_distance_and_are_drawn_by_the_error_there(cloud
         exact = found.points.norm(dim=1) - RADIUS
         assert (exact.abs() > 0.9 * module.SAMPLING.clear * gaps).all()
         assert torch.allclose(found.distance, exact.clamp(-2 * delta, 2 * delta), atol=5e-3)
-        error = (found.value - found.distance).abs()
+        error = (found.value - module.nearest_known(found.value, found.distance, 0.5 * delta)).abs()
         torch.testing.assert_close(found.area, error + module.SAMPLING.right * error.mean())
     invented = PHANTOM.value(found.points) < exact - 0.01
     assert invented.sum() > 30
     assert found.area[invented].mean() > 5 * found.area[~invented].mean()
     sparse = CloudDistance(*sphere_points(300))  # between its points the band is far from all of them
     assert len(off_surface(sparse, Sphere(radius=RADIUS), delta=0.01).clear) == 0
+
+
+def test_a_clear_place_has_no_error_between_the_least_distance_and_that_of_the_points() -> None:
+    value = torch.tensor([-1.0, 0.1, 0.3, 0.7, 2.0])
+    for sign in (1.0, -1.0):
+        distance = torch.full((5,), sign * 0.5)
+        possible = module.nearest_known(sign * value, distance, 0.2)
+        torch.testing.assert_close(possible, sign * torch.tensor([0.2, 0.2, 0.3, 0.5, 0.5]))
+        assert torch.equal(module.nearest_known(value, distance, math.inf), distance)
+        assert torch.equal(module.nearest_known(value, distance, 0.8), distance)  # the points are nearer than that
 
 
 def test_places_in_less_doubt_are_clear_where_normals_are_guesses() -> None:
@@ -321,9 +333,9 @@ def test_clear_places_begin_with_no_more_loss_than_the_others(cloud: CloudDistan
     *others, clear = module.banded_sources(cloud, previous, 0.05, config, generator=generator())
     assert clear.name == "clear"
     value, distance = clear.samples.known("value", "distance")
-    error, area = (value - distance).square(), clear.samples.area
-    assert clear.scales.data == pytest.approx(float(error.median()))
-    loss = float((area * pseudo_huber(error, clear.scales.data)).sum() / area.sum())
+    assert clear.scales.data == pytest.approx(float((value - distance).square().median()))
+    missed, area = value - module.nearest_known(value, distance, 0.025), clear.samples.area
+    loss = float((area * pseudo_huber(missed.square(), clear.scales.data)).sum() / area.sum())
     begun = sum(source.begins() for source in others)
     assert others[0].data * loss > begun, "this shows nothing"
     assert clear.begins() == pytest.approx(clear.data * loss, rel=1e-5)
