@@ -23,9 +23,10 @@ from .consistency import (
     ConsistencyOptions,
     GreyPictures,
     Pixels,
+    Surface,
     consistency_loss,
     flatness_loss,
-    surface_near,
+    surface_between,
 )
 from .measured import MeasuredDepths, depth_loss
 from .model import RayPool, Rays, SceneModel
@@ -252,19 +253,15 @@ class SceneObjective(Objective):
     def consistency_terms(
         self, pictures: GreyPictures, rays: Rays, lines: tuple[Tensor, Tensor], rendered: Rendered, level: int
     ) -> tuple[Tensor, Tensor]:
-        """Means of `consistency_loss` and `flatness_loss` over the first rays that meet something.
+        """Means of `consistency_loss` and `flatness_loss` over the first rays that enter the surface.
 
         ``lines`` are the eyes and directions of the rays.
         """
         pool, poses, options = self.pool, self.model.poses, self.patches
-        opaque = rendered.opacity.detach() > 0.5
-        rows = first_rows(opaque, min(options.patches, len(opaque)))
-        used, rows = rows < len(opaque), rows.clamp(max=len(opaque) - 1)
-        origins, directions = lines[0][rows], lines[1][rows]
-        # Half of the light is stopped before the median depth.
-        middle = (rendered.weights.detach()[rows].cumsum(dim=1) >= 0.5).int().argmax(dim=1, keepdim=True)
-        depth = rendered.depths[rows].gather(1, middle)[:, 0]
-        surface = surface_near(self.model.geometry, origins, directions, depth, options, level=level)
+        surface = surface_between(rendered, *lines, options)
+        rows = first_rows(surface.found, min(options.patches, len(surface.found)))
+        used, rows = rows < len(surface.found), rows.clamp(max=len(surface.found) - 1)
+        surface = Surface(*(part[rows] for part in surface))
         surface = surface._replace(found=surface.found & used)
         cameras = Cameras(pool.eyes, pool.axes, pool.lens)
         if poses is not None:

@@ -9,7 +9,8 @@ import torch
 from fields import solve_sphere
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.views.images import PosedImage
-from mplicits.neural_fields import Field, FunctionField, MultiscaleSDF, sphere_trace
+from mplicits.neural_fields import Field, FunctionField, MultiscaleSDF, Sphere, render_volume, sphere_trace
+from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.reconstruct.consistency import (
     Cameras,
     ConsistencyOptions,
@@ -20,7 +21,7 @@ from mplicits.pipelines.reconstruct.consistency import (
     consistency_loss,
     correlation,
     flatness_loss,
-    surface_near,
+    surface_between,
     warp,
 )
 from torch import Tensor
@@ -77,15 +78,35 @@ def pixels_and_rays(cameras: Cameras, count: int = 40) -> tuple[Pixels, Tensor, 
     return Pixels(view, place), cameras.eyes[view], directions
 
 
-def plane(height: Tensor | float = 0.0, normal: Tensor = NORMAL) -> Field:
-    return FunctionField(lambda x: x @ normal.to(x) - height)
+class Plane(torch.nn.Module):
+    """The textured plane, moved by a height and tilted by a slope."""
+
+    def __init__(self, height: float, slope: float) -> None:
+        super().__init__()
+        self.height, self.slope = (torch.nn.Parameter(torch.tensor(number).double()) for number in (height, slope))
+
+    def forward(self, x: Tensor) -> Tensor:
+        tilt = self.slope * torch.tensor([1.0, 0.0, 0.0])
+        return x @ torch.nn.functional.normalize(NORMAL + tilt, dim=0).to(x) - self.height
+
+
+def plane(height: float = 0.0) -> Field:
+    return FunctionField(Plane(height, 0.0).requires_grad_(False))
+
+
+def surface_of(field: Field, origins: Tensor, directions: Tensor, samples: int = 300, skip: float = 0.0) -> Surface:
+    """The surface between evenly spaced samples, which do not move with the field."""
+    rendered = render_volume(
+        field, lambda x, *_: torch.zeros_like(x), origins, directions,
+        inv_std=64.0, sampling=Sampling(uniform=samples, importance=0), alpha_threshold=skip,
+    )  # fmt: skip
+    return surface_between(rendered, origins, directions, OPTIONS)
 
 
 def loss_of(field: Field, parts: tuple[Cameras, GreyPictures, list[Camera]], options=OPTIONS, distance=None) -> Tensor:
     cameras, pictures, _ = parts
     pixels, origins, directions = pixels_and_rays(cameras)
-    depth = torch.full((len(origins),), 2.4, dtype=torch.float64)
-    surface = surface_near(field, origins, directions, depth, options)
+    surface = surface_of(field, origins, directions)
     return consistency_loss(surface, pixels, cameras, pictures, distance or field.value, options)
 
 
@@ -106,7 +127,7 @@ def test_grey_values_are_bilinear_and_those_of_the_border_beyond_it() -> None:
 def test_the_homography_maps_as_rays_do_that_meet_the_plane() -> None:
     cameras, _, cams = scene()
     pixels, origins, directions = pixels_and_rays(cameras)
-    surface = surface_near(plane(), origins, directions, torch.full((40,), 2.0, dtype=torch.float64), OPTIONS)
+    surface = surface_of(plane(), origins, directions)
     assert bool(surface.found.all())
     offsets = torch.tensor([[0, 0], [-3, 2], [3, 3]])
     neighbours = torch.tensor([[1, 4]]).expand(40, 2)
@@ -123,23 +144,22 @@ def test_patches_correlate_on_the_true_plane_and_pull_towards_it() -> None:
     parts = scene()
     true = float(loss_of(plane(), parts).mean())
     assert true < 0.01  # of bilinear interpolation: (2π / 10 pixels)² / 8 of the amplitude at most, a twentieth
-    for height in (0.02, -0.02):
-        moved = torch.tensor(height, dtype=torch.float64, requires_grad=True)
-        loss = loss_of(plane(moved), parts).mean()
-        (slope,) = torch.autograd.grad(loss, moved)
+    for number in (0.02, -0.02):
+        field = FunctionField(Plane(number, 0.0))
+        loss = loss_of(field, parts).mean()
+        uphill, _ = torch.autograd.grad(loss, list(field.parameters()))
         assert float(loss.detach()) > 3 * true
-        assert float(slope) * height > 0  # downhill is towards 0
-    for angle in (0.15, -0.15):
-        tilted = torch.tensor(angle, dtype=torch.float64, requires_grad=True)
-        axis = torch.nn.functional.normalize(NORMAL + tilted * torch.tensor([1.0, 0.0, 0.0]), dim=0)
-        (slope,) = torch.autograd.grad(loss_of(plane(0.0, axis), parts).mean(), tilted)
-        assert float(slope) * angle > 0
+        assert float(uphill) * number > 0  # downhill is towards 0
+    for number in (0.15, -0.15):
+        field = FunctionField(Plane(0.0, number))
+        _, uphill = torch.autograd.grad(loss_of(field, parts).mean(), list(field.parameters()))
+        assert float(uphill) * number > 0
 
 
 def test_neighbours_look_from_other_angles_and_past_what_hides_them() -> None:
     cameras, pictures, _ = scene()
     pixels, origins, directions = pixels_and_rays(cameras)
-    surface = surface_near(plane(), origins, directions, torch.full((40,), 2.5, dtype=torch.float64), OPTIONS)
+    surface = surface_of(plane(), origins, directions)
     chosen, visible = choose_neighbours(surface, pixels.view, cameras, pictures, plane().value, OPTIONS)
     # Neither the photograph itself nor the one at 50°.
     assert all(set(row[seen].tolist()) == {1, 2, 3} for row, seen in zip(chosen, visible, strict=True))
@@ -179,8 +199,7 @@ def test_surfaces_and_their_derivatives_are_those_of_sphere_tracing() -> None:
     eye = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
     directions = torch.nn.functional.normalize(torch.tensor([[0.1, 0.0, -1.0], [0.0, -0.15, -1.0]]).double(), dim=1)
     hits = sphere_trace(field, eye, directions, tolerance=1e-10, differentiable=True)
-    exact = replace(OPTIONS, newton=6)
-    surface = surface_near(field, eye.expand(2, 3), directions, torch.full((2,), 1.4).double(), exact)
+    surface = surface_of(field, eye.expand(2, 3), directions, samples=4000)
     assert bool(surface.found.all())
     assert torch.allclose(surface.position, hits.position, atol=1e-6)
     weights = [parameter for parameter in field.parameters() if parameter.requires_grad]
@@ -189,18 +208,37 @@ def test_surfaces_and_their_derivatives_are_those_of_sphere_tracing() -> None:
         assert torch.allclose(mine, other, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.parametrize("skip", [0.0, 1e-3])
+def test_surface_points_are_as_near_as_linear_interpolation_or_not_found(skip: float) -> None:
+    """Of a ball, f'' is (1 − s²) / |x| along a ray, and the error at most h² f'' / 8 / |s|."""
+    radius, samples = 0.5, 40
+    across = torch.linspace(-0.6, 0.6, 41, dtype=torch.float64)
+    eyes = torch.stack((across, torch.zeros(41), torch.full((41,), 2.0)), dim=1)
+    ahead = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand_as(eyes)
+    surface = surface_of(Sphere(radius=radius), eyes, ahead, samples=samples, skip=skip)
+    slope = (1 - (across / radius) ** 2).clamp(min=0).sqrt()
+    interval = 2 / samples  # at most
+    assert torch.equal(surface.found, slope > OPTIONS.facing)
+    error = (surface.position.norm(dim=1) - radius)[surface.found]
+    inner = radius - interval
+    assert bool((error.abs() <= interval**2 * ((1 - slope[surface.found] ** 2) / inner + 1e-9) / 8).all())
+    assert torch.allclose(surface.normal.norm(dim=1)[surface.found], torch.ones(1).double())
+    thin = surface_of(Sphere(radius=0.03), eyes, ahead, samples=samples, skip=skip)
+    assert not bool(thin.found.any())  # bent by far more than can be interpolated
+
+
 def test_the_gradient_is_that_of_finite_differences() -> None:
     """In the weights of a small network whose surface is a sphere beside the plane: position and normal both matter."""
     parts = scene()
     field = MultiscaleSDF.from_widths([(8, 1)], omegas=[3.0]).double()
     solve_sphere(field.base, 0.5)
     # Every pixel counts, so that the loss has no steps.
-    every = replace(OPTIONS, floor=-1.0, texture=0.0, newton=8)
+    every = replace(OPTIONS, floor=-1.0, texture=0.0)
     cameras, pictures, _ = parts
 
     def loss() -> Tensor:
         pixels, origins, directions = pixels_and_rays(cameras, 6)
-        surface = surface_near(field, origins, directions, torch.full((6,), 2.0, dtype=torch.float64), every)
+        surface = surface_of(field, origins, directions)
         assert bool(surface.found.any())
         return consistency_loss(surface, pixels, cameras, pictures, lambda x: torch.ones_like(x[..., 0]), every).sum()
 
@@ -222,7 +260,7 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
 def test_what_misses_counts_nothing() -> None:
     cameras, pictures, _ = scene()
     pixels, origins, directions = pixels_and_rays(cameras)
-    far = surface_near(lambda x: x.norm(dim=-1) - 0.01, origins, directions, torch.full((40,), 2.5).double(), OPTIONS)
+    far = surface_of(Sphere(radius=0.01), origins, directions)
     assert not bool(far.found.any())
     loss = consistency_loss(far, pixels, cameras, pictures, plane().value, OPTIONS)
     assert float(loss.abs().max()) == 0
@@ -236,7 +274,7 @@ def test_what_misses_counts_nothing() -> None:
 def flatness_of(field: Field, parts: tuple[Cameras, GreyPictures, list[Camera]], options=OPTIONS) -> Tensor:
     cameras, pictures, _ = parts
     pixels, origins, directions = pixels_and_rays(cameras)
-    surface = surface_near(field, origins, directions, torch.full((len(origins),), 2.4, dtype=torch.float64), options)
+    surface = surface_of(field, origins, directions)
     assert bool(surface.found.all())
     return flatness_loss(field, surface, pixels, cameras, pictures, options, torch.Generator().manual_seed(0))
 
@@ -244,7 +282,7 @@ def flatness_of(field: Field, parts: tuple[Cameras, GreyPictures, list[Camera]],
 def test_a_plane_is_flat_and_a_sphere_bends_by_its_radius_where_pictures_are_plain() -> None:
     parts = scene(plain=True)
     assert float(flatness_of(plane(0.1), parts).abs().max()) < 1e-12
-    radius, known = 2.0, replace(OPTIONS, newton=6, nearest=0.1, furthest=0.1 * (1 + 1e-9))
+    radius, known = 2.0, replace(OPTIONS, nearest=0.1, furthest=0.1 * (1 + 1e-9))
     ball = FunctionField(lambda x: (x + radius * NORMAL.to(x)).norm(dim=-1) - radius)
     bend = 2 * (math.hypot(radius, 0.1) - radius) / 0.1  # of each tangent alike
     expected = math.hypot(bend, OPTIONS.bend) - OPTIONS.bend
