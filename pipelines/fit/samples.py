@@ -129,11 +129,13 @@ class Source:
         return float(sum(weight * (area * loss).sum() for _, weight, loss in terms) / area.sum())
 
     def held_back(self, others: Sequence[Source]) -> Source:
-        """The source that begins with no more loss than the ``others``; errors above their median count linearly.
+        """The source that begins with no more loss than the ``others``; its scale is a median where theirs are.
 
         Far places with errors as large as the band would else be all that a level learns from.
         """
-        usual = max(float(data_loss(*self.samples.known("value", "distance")).median()), LEAST.data)
+        usual = math.inf
+        if others[0].scales.data < usual:
+            usual = max(float(data_loss(*self.samples.known("value", "distance")).median()), LEAST.data)
         source = replace(self, scales=self.scales._replace(data=usual))
         share = sum(other.begins() for other in others) / max(source.begins(), 1e-30)
         return replace(source, data=min(share, 1.0) * self.data)

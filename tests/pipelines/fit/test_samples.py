@@ -1,6 +1,7 @@
 """Samples of a sphere's cloud against what the sphere says."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -330,16 +331,21 @@ def test_near_a_cloud_of_guessed_normals_winding_numbers_tell_the_side() -> None
 def test_clear_places_begin_with_no_more_loss_than_the_others(cloud: CloudDistance) -> None:
     """A phantom of the size of the band, whose errors would be most of the loss."""
     previous, config = Union(Sphere(radius=RADIUS + 0.01), PHANTOM), FitConfig(samples=100_000)
-    *others, clear = module.banded_sources(cloud, previous, 0.05, config, generator=generator())
-    assert clear.name == "clear"
-    value, distance = clear.samples.known("value", "distance")
-    assert clear.scales.data == pytest.approx(float((value - distance).square().median()))
-    missed, area = value - module.nearest_known(value, distance, 0.025), clear.samples.area
-    loss = float((area * pseudo_huber(missed.square(), clear.scales.data)).sum() / area.sum())
-    begun = sum(source.begins() for source in others)
-    assert others[0].data * loss > begun, "this shows nothing"
-    assert clear.begins() == pytest.approx(clear.data * loss, rel=1e-5)
-    assert clear.begins() == pytest.approx(begun, rel=1e-5)
+    *others, found = module.banded_sources(cloud, previous, 0.05, config, generator=generator())
+    assert found.name == "clear"
+    value, distance = found.samples.known("value", "distance")
+    missed, area = (value - module.nearest_known(value, distance, 0.025)).square(), found.samples.area
+    usual = float((value - distance).square().median())
+    robust = [replace(other, scales=module.RobustScales(data=1e-4)) for other in others]
+    for given, scale in ((others, math.inf), (robust, usual)):  # as at level 1, and at the next ones
+        clear = replace(found, data=others[0].data).held_back(given)
+        assert given is robust or clear.data == found.data
+        assert clear.scales.data == pytest.approx(scale)
+        loss = float((area * pseudo_huber(missed, scale)).sum() / area.sum())
+        begun = sum(source.begins() for source in given)
+        assert others[0].data * loss > begun, "this shows nothing"
+        assert clear.begins() == pytest.approx(clear.data * loss, rel=1e-5)
+        assert clear.begins() == pytest.approx(begun, rel=1e-5)
 
 
 @pytest.mark.parametrize(("guessed", "left"), [(True, module.SAMPLING.left), (False, 1.0)])
