@@ -188,18 +188,6 @@ class ValueGrid:
 
     def __call__(self, x: Tensor) -> Tensor:
         """Interpolated values ``(...,)`` of points ``(..., 3)``; outside the cube, the value at its nearest point."""
-        points = x.reshape(-1, 3)
-        count = self.resolution + 1
-        at = (points.clamp(-1, 1) + 1) * (0.5 * self.resolution)
-        cell = at.floor().clamp(max=self.resolution - 1)
-        u, v, w = (at - cell).unbind(dim=1)
-        i, j, k = cell.long().unbind(dim=1)
-        first, flat = (i * count + j) * count + k, self.kept.view(-1)
-
-        def edge(offset: int) -> Tensor:
-            """Between the two vertices along z."""
-            return torch.lerp(flat[first + offset], flat[first + offset + 1], w)
-
-        near = torch.lerp(edge(0), edge(count), v)
-        far = torch.lerp(edge(count * count), edge(count * count + count), v)
-        return torch.lerp(near, far, u).reshape(x.shape[:-1])
+        at = x.flip(-1).reshape(1, 1, 1, -1, 3)  # z, y, x
+        found = nn.functional.grid_sample(self.kept[None, None], at, padding_mode="border", align_corners=True)
+        return found.reshape(x.shape[:-1])
