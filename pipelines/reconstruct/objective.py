@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ...neural_fields import InputError
 from ...neural_fields.backend.devices import graph_input, has_graph_inputs
 from ...neural_fields.backend.fixed_shapes import FixedShapes, first_rows, fixed_shapes
 from ...neural_fields.fields.losses import eikonal_loss
@@ -143,12 +144,13 @@ class SceneObjective(Objective):
     def read_back(self, step: int, samples: Tensor) -> None:
         """Read what the next steps depend on from the device in one copy, which waits for a GPU."""
         unsure = 1 / self.model.inv_std.detach()
-        known = [samples, unsure.to(samples)]
-        if self.grid is None:
-            self.kept["lately"] = torch.stack(known).cpu()
-            return
-        *lately, moved = torch.stack([*known, self.kept["moved"].to(samples)]).tolist()
+        shift = unsure if self.grid is None else self.kept["moved"]
+        *lately, moved = torch.stack([samples, unsure.to(samples), shift.to(samples)]).tolist()
+        if math.isnan(lately[1]):
+            raise InputError(f"training diverged before step {step}; begin again with a lower --learning-rate")
         self.kept["lately"] = torch.tensor(lately)
+        if self.grid is None:
+            return
         last, pause, count = self.kept["looks"].tolist()
         plan = self.schedule
         if last > step - plan.near_every:  # since this was done last
@@ -226,8 +228,8 @@ class SceneObjective(Objective):
         total = color + config.eikonal_weight * eikonal
         if pool.has_masks and config.mask_weight:
             opacity = rendered.opacity.clamp(1e-3, 1 - 1e-3)
-            mask = torch.nn.functional.binary_cross_entropy(opacity, rays.mask)
-            terms["mask"] = mask
+            # PyTorch's own stops a GPU for good where a training has diverged.
+            terms["mask"] = mask = -torch.lerp((1 - opacity).log(), opacity.log(), rays.mask).mean()
             total = total + config.mask_weight * mask
         if self.measured is not None and kind.measured:
             depth = self.depth_term(self.measured, kind.level)

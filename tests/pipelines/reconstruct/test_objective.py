@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 import torch
 from mplicits.datasets.views.images import PosedImage, PosedImages
-from mplicits.neural_fields import Similarity, fit_sphere
+from mplicits.neural_fields import InputError, Similarity, fit_sphere
 from mplicits.neural_fields.fields.losses import eikonal_loss
 from mplicits.neural_fields.volume.weights import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
@@ -241,6 +241,15 @@ def test_the_grid_that_rays_march_on_is_that_of_the_coarse_level(images: PosedIm
     # An eighth of the cube is 0.25 across: for the curvature 2/r of a sphere at r ≥ 0.1, 3/8 · h² · 10.
     assert float((grid(points) - before)[points.norm(dim=1) > 0.1].abs().max()) < 3 / 8 * 0.25**2 * 10
     assert torch.equal(trainer.state()["march"], grid.kept)
+
+
+@pytest.mark.parametrize("march_grid", [0, 8])
+def test_a_training_that_has_diverged_ends_with_a_line(images: PosedImages, march_grid: int) -> None:
+    trainer = make(images, replace(TINY, steps=1000, march_grid=march_grid))
+    with torch.no_grad():
+        next(trainer.objective.model.geometry.parameters()).fill_(torch.nan)
+    with pytest.raises(InputError, match=r"diverged before step 15; .* lower --learning-rate"):
+        trainer.run()
 
 
 def test_the_grid_is_left_alone_while_the_surface_rests(images: PosedImages) -> None:
