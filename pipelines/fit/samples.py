@@ -116,8 +116,10 @@ class Source:
         scales = self.scales
         yield "eikonal", self.eikonal, pseudo_huber(eikonal_loss(gradient), scales.eikonal)
         if batch.distance is not None:
-            missed = data_loss(value, nearest_known(value.detach(), batch.distance, self.least))
-            yield "data", self.data, pseudo_huber(missed, scales.data)
+            known = batch.distance
+            if self.least < math.inf:
+                known = nearest_known(value.detach(), known, self.least)
+            yield "data", self.data, pseudo_huber(data_loss(value, known), scales.data)
         if batch.normal is not None:
             yield "normal", self.normal, pseudo_huber(normal_loss(gradient, batch.normal), scales.normal)
 
