@@ -109,16 +109,17 @@ class GreyPictures:
 def surface_between(rendered: Rendered, origins: Tensor, directions: Tensor, options: ConsistencyOptions) -> Surface:
     """Where rays ``(R, 3)`` first enter, by linear interpolation between two rendered samples; no field is evaluated.
 
-    With values f₀ > 0 > f₁ at depths t₀ and t₁ it is t = (f₀ t₁ − f₁ t₀) / (f₀ − f₁), and gradients are interpolated
+    With values f₀ > 0 > f₁ at depths t₀ and t₁ it is t = (f₀ t₁ − f₁ t₀) / (f₀ − f₁). Gradients are interpolated
     alike. With slopes s along the ray, f is wrong there by up to (t₁ − t₀) |s₁ − s₀| / 8 where f'' is constant.
     """
     values, gradients, _ = rendered.jet
     enters = (values[:, :-1] > 0) & (values[:, 1:] < 0)  # of skipped samples values are 0
     found, outer = enters.any(dim=1), enters.int().argmax(dim=1, keepdim=True)
     pair = torch.cat((outer, outer + 1), dim=1)  # (R, 2)
-    value, depth = values.gather(1, pair), rendered.depths.gather(1, pair)
+    depth = rendered.depths.gather(1, pair)
+    before, after = values.gather(1, pair).unbind(dim=1)
     gradient = gradients.gather(1, pair[:, :, None].expand(-1, -1, 3))
-    share = (value[:, 0] / torch.where(found, value[:, 0] - value[:, 1], 1.0))[:, None]
+    share = (before / torch.where(found, before - after, 1.0))[:, None]
     position = origins + torch.lerp(depth[:, :1], depth[:, 1:], share) * directions
     normal = torch.lerp(gradient[:, 0], gradient[:, 1], share)
     normal = torch.where(found[:, None], normal, -directions)  # any that faces the eye, so that derivatives are finite
